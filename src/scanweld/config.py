@@ -1,0 +1,153 @@
+"""Configuration: frozen dataclasses in code, TOML in files; an unknown key is an error that names the nearest."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import json
+import math
+import tomllib
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, TypeVar, get_type_hints
+
+from scanweld.errors import ConfigError
+
+T = TypeVar("T")
+
+
+def setting(default: Any, doc: str, *, low: float | None = None, high: float | None = None) -> Any:
+    """Declare a dataclass field with its documentation and allowed range (both ends included)."""
+    return dataclasses.field(default=default, metadata={"doc": doc, "low": low, "high": high})
+
+
+def section(factory: type[Any], doc: str) -> Any:
+    """Declare a nested configuration."""
+    return dataclasses.field(default_factory=factory, metadata={"doc": doc})
+
+
+def check_ranges(config: Any) -> None:
+    """Raise ConfigError when a field declared by :func:`setting` is out of its range; for `__post_init__`."""
+    for item in dataclasses.fields(config):
+        value = getattr(config, item.name)
+        low, high = item.metadata.get("low"), item.metadata.get("high")
+        if isinstance(value, (int, float)) and not isinstance(value, bool):
+            bad = math.isnan(value) or (low is not None and value < low) or (high is not None and value > high)
+            if bad:
+                bounds = f"{'-inf' if low is None else low} to {'inf' if high is None else high}"
+                raise ConfigError(f"{item.name} = {value}: expected a value from {bounds} ({item.metadata['doc']})")
+
+
+def from_mapping(kind: type[T], values: Mapping[str, Any], where: str = "configuration", prefix: str = "") -> T:
+    """Build the dataclass `kind` from nested mappings; absent keys keep their defaults.
+
+    Raises
+    ------
+    ConfigError
+        On an unknown key (the message names the nearest one), a wrong type or a value out of range.
+    """
+    hints = get_type_hints(kind)
+    known = {f.name: f for f in dataclasses.fields(kind)}  # type: ignore[arg-type]
+    arguments: dict[str, Any] = {}
+    for key, value in values.items():
+        if key not in known:
+            raise ConfigError(f"{where}: unknown key '{prefix}{key}'{_nearest(key, known, prefix)}")
+        hint = hints[key]
+        if dataclasses.is_dataclass(hint):
+            if not isinstance(value, Mapping):
+                raise ConfigError(f"{where}: '{prefix}{key}' is a section, got the value {value!r}")
+            arguments[key] = from_mapping(hint, value, where, f"{prefix}{key}.")  # type: ignore[arg-type]
+        else:
+            arguments[key] = _checked(value, hint, f"{where}: '{prefix}{key}'")
+    try:
+        return kind(**arguments)
+    except ConfigError as error:
+        raise ConfigError(f"{where}: {prefix}{error}") from None
+
+
+def _nearest(key: str, known: Iterable[str], prefix: str) -> str:
+    close = difflib.get_close_matches(key, list(known), n=1, cutoff=0.4)
+    names = ", ".join(sorted(known))
+    return f"; did you mean '{prefix}{close[0]}'?" if close else f"; known keys: {names}"
+
+
+def _checked(value: Any, hint: Any, where: str) -> Any:
+    allowed = {float: (int, float), int: (int,), bool: (bool,), str: (str,)}.get(hint)
+    if allowed is None:
+        return value
+    if not isinstance(value, allowed) or (isinstance(value, bool) and hint is not bool):
+        raise ConfigError(f"{where}: expected {hint.__name__}, got {value!r}")
+    return hint(value)
+
+
+def load_toml(path: Path) -> dict[str, Any]:
+    """Read a TOML file as nested dictionaries."""
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise ConfigError(f"{path}: no such file") from None
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise ConfigError(f"{path}: not a readable TOML file: {error}") from None
+
+
+def merge(base: Mapping[str, Any], extra: Mapping[str, Any]) -> dict[str, Any]:
+    """Return `base` with the values of `extra`, section by section; neither is changed."""
+    merged = dict(base)
+    for key, value in extra.items():
+        mine = merged.get(key)
+        merged[key] = merge(mine, value) if isinstance(mine, Mapping) and isinstance(value, Mapping) else value
+    return merged
+
+
+def parse_override(text: str) -> dict[str, Any]:
+    """Turn ``a.b=value`` into {"a": {"b": value}}; the value is TOML, or else a plain string."""
+    key, separator, raw = text.partition("=")
+    if not separator or not key.strip():
+        raise ConfigError(f"--set {text}: expected key=value, for example tracking.stable_fraction=0.1")
+    try:
+        value: Any = tomllib.loads(f"v = {raw}")["v"]
+    except tomllib.TOMLDecodeError:
+        value = raw.strip()
+    for part in reversed(key.strip().split(".")):
+        value = {part: value}
+    result: dict[str, Any] = value
+    return result
+
+
+def to_toml(config: Any) -> str:
+    """Write a configuration as TOML, every key with its documentation; :func:`from_mapping` reads it back."""
+    return "\n".join(_toml_lines(config, ())) + "\n"
+
+
+def _toml_lines(config: Any, path: tuple[str, ...]) -> list[str]:
+    lines: list[str] = []
+    if path:
+        lines += ["", f"[{'.'.join(path)}]"]
+    nested = []
+    for item in dataclasses.fields(config):
+        value = getattr(config, item.name)
+        if dataclasses.is_dataclass(value):
+            nested.append((item.name, value))
+            continue
+        if value is None:
+            continue
+        doc = item.metadata.get("doc")
+        if doc:
+            lines.append(f"# {doc}")
+        lines.append(f"{item.name} = {_toml_value(value)}")
+    for name, value in nested:
+        lines += _toml_lines(value, (*path, name))
+    return lines
+
+
+def _toml_value(value: Any) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, float):
+        return {math.inf: "inf", -math.inf: "-inf"}.get(value, repr(value))
+    if isinstance(value, int):
+        return str(value)
+    if isinstance(value, (list, tuple)):
+        return "[" + ", ".join(_toml_value(v) for v in value) + "]"
+    # A JSON string is a TOML basic string, but for DEL, which TOML wants escaped.
+    return json.dumps(str(value), ensure_ascii=False).replace("\x7f", "\\u007f")

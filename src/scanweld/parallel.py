@@ -1,0 +1,123 @@
+"""Compiled kernels and the threads that run them.
+
+Kernels are serial Numba functions that release the GIL; :func:`run_ranges` splits their work over a pool of
+Python threads. There is no OpenMP, no `prange` and no lock: the same kernels serve one thread and many, compile
+in half the time, and give the same bytes at any thread count because every sum is formed per fixed-size chunk
+and the chunks are added in order (docs/decisions/0001-threads.md).
+
+Importing this module loads Numba (about half a second); `import scanweld` does not import it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+import tempfile
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+PACKAGE = Path(__file__).parent
+
+
+def _kernel_cache_folder() -> Path:
+    """Folder of the on-disk kernel cache, named by a hash of every kernel source.
+
+    Numba does not notice that a called function in another module has changed, so a changed kernel must lead to
+    a fresh folder.
+    """
+    digest = hashlib.sha256()
+    for source in sorted([*PACKAGE.rglob("kernels.py"), Path(__file__)]):
+        digest.update(source.relative_to(PACKAGE).as_posix().encode())
+        digest.update(source.read_bytes())
+    root = os.environ.get("XDG_CACHE_HOME") or (Path.home() / ".cache" if os.environ.get("HOME") else None)
+    name = f"kernels-{digest.hexdigest()[:16]}"
+    if root is not None:
+        folder = Path(root) / "scanweld" / name
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryFile(dir=folder):
+                return folder
+        except OSError:
+            pass
+    return Path(tempfile.gettempdir()) / f"scanweld-{os.getuid() if hasattr(os, 'getuid') else 'user'}" / name
+
+
+os.environ.setdefault("NUMBA_CACHE_DIR", str(_kernel_cache_folder()))
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # spinning OpenMP workers of other libraries starve ours
+
+import numba  # noqa: E402  (the two variables above must be set before it loads)
+
+# error_model "numpy": a division by zero gives inf, not a branch. Kernels test masks, never NaN (fast-math).
+kernel: Callable[[Any], Any] = numba.njit(
+    fastmath=True, error_model="numpy", boundscheck=False, cache=True, nogil=True
+)
+"""Decorator of every compiled kernel."""
+
+inlined: Callable[[Any], Any] = numba.njit(
+    fastmath=True, error_model="numpy", boundscheck=False, cache=True, nogil=True, inline="always"
+)
+"""Decorator of a small function that becomes part of the kernels that call it."""
+
+
+def kernels_are_cached(group: str, *, now: bool = False) -> bool:
+    """Whether an earlier process compiled a group of kernels for this version; `now` notes that they are.
+
+    The note is a file in the cache folder, so it goes with the cache.
+    """
+    note = Path(os.environ["NUMBA_CACHE_DIR"]) / f"{group}.compiled"
+    if now:
+        with contextlib.suppress(OSError):  # a read-only cache: the next process compiles again
+            note.touch()
+    return note.exists()
+
+
+_num_threads = max(1, min(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1, 16))
+_pool: ThreadPoolExecutor | None = None
+
+
+def get_num_threads() -> int:
+    """Number of threads that :func:`run_ranges` uses."""
+    return _num_threads
+
+
+def set_num_threads(count: int) -> None:
+    """Use `count` threads from now on; results do not depend on it."""
+    global _num_threads, _pool
+    if count < 1:
+        raise ValueError(f"expected at least one thread, got {count}")
+    if _pool is not None and count != _num_threads:
+        _pool.shutdown(wait=True)
+        _pool = None
+    _num_threads = count
+
+
+def split_range(count: int, parts: int) -> list[tuple[int, int]]:
+    """Split range(count) into at most `parts` contiguous, nearly equal, non-empty ranges."""
+    parts = max(1, min(parts, count))
+    bounds = [count * i // parts for i in range(parts + 1)]
+    return list(zip(bounds[:-1], bounds[1:], strict=True))
+
+
+def run_ranges(count: int, body: Callable[[int, int], object]) -> None:
+    """Call `body(start, stop)` on contiguous ranges that cover range(count), one range a thread.
+
+    The caller's thread takes the first range. What `body` writes for index i must depend on i alone.
+    """
+    global _pool
+    if count <= 0:
+        return
+    ranges = split_range(count, _num_threads)
+    if len(ranges) == 1:
+        body(0, count)
+        return
+    if _pool is None:
+        _pool = ThreadPoolExecutor(max_workers=_num_threads - 1, thread_name_prefix="scanweld")
+    futures: list[Future[object]] = [_pool.submit(body, start, stop) for start, stop in ranges[1:]]
+    try:
+        body(*ranges[0])
+    finally:
+        for future in futures:
+            future.result()
