@@ -1,0 +1,1 @@
+"""Transforms, cameras, frames, depth images, point clouds, normals."""

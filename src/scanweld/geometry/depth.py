@@ -1,0 +1,143 @@
+"""From a depth image to surfaces: bilateral filter, pyramid, vertices, normals, and how noisy they are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from scanweld.arrays import Float32
+from scanweld.config import check_ranges, setting
+from scanweld.errors import InvalidInputError
+from scanweld.geometry import kernels
+from scanweld.geometry.camera import PinholeCamera
+from scanweld.geometry.frame import Frame
+from scanweld.parallel import run_ranges
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SurfaceConfig:
+    """How depth becomes surfaces."""
+
+    max_depth_m: float = setting(8.0, "depth beyond this is invalid [m]; raise for halls, costs noise", low=0.1)
+    noise_floor_m: float = setting(0.0012, "depth noise at noise_nearest_m [m]; raise for a worse sensor", low=1e-6)
+    noise_growth: float = setting(0.0019, "growth of the noise with the square of the depth [1/m]", low=0.0)
+    noise_nearest_m: float = setting(0.4, "depth of the least noise [m]", low=0.0)
+    normal_radius: int = setting(2, "window radius of the normals [pixels]; raise for noise, lower for detail", low=1, high=8)
+    min_cosine: float = setting(0.15, "surfaces seen more flatly than this cosine have no normal", low=0.01, high=1.0)
+    levels: int = setting(3, "pyramid levels; raise for fast motion", low=1, high=6)
+    bilateral: bool = setting(False, "smooth the depth before taking normals; slower")
+
+    def __post_init__(self) -> None:
+        check_ranges(self)
+
+    @property
+    def noise(self) -> Float32:
+        """sigma(z) = n[0] + n[1] (z - n[2])^2, axial noise of Nguyen et al. 2012 (eq. 5)."""
+        return np.array([self.noise_floor_m, self.noise_growth, self.noise_nearest_m], np.float32)
+
+
+@dataclass(frozen=True, slots=True)
+class SurfaceLevel:
+    """One pyramid level.
+
+    Attributes
+    ----------
+    camera : intrinsics of this level
+    depth_m : (H, W) float32, 0 invalid [m]
+    surface : (H, W, 8) float32, camera frame: vertex [m], unit normal towards the camera, 1 / sigma [1/m],
+        surfel radius [m]; the last five are 0 where there is no normal
+    """
+
+    camera: PinholeCamera
+    depth_m: Float32
+    surface: Float32
+
+    @property
+    def vertices_m(self) -> Float32:
+        """(H, W, 3) view, 0 where invalid [m, camera frame]."""
+        return self.surface[..., 0:3]
+
+    @property
+    def normals(self) -> Float32:
+        """(H, W, 3) view, 0 where invalid [camera frame]."""
+        return self.surface[..., 3:6]
+
+
+@dataclass(frozen=True, slots=True)
+class SurfacePyramid:
+    """A frame and its surfaces, finest level first."""
+
+    frame: Frame
+    levels: tuple[SurfaceLevel, ...]
+
+
+def build_pyramid(frame: Frame, config: SurfaceConfig | None = None) -> SurfacePyramid:
+    """Compute vertices and normals of a frame at each pyramid level."""
+    config = config or SurfaceConfig()
+    depth = frame.depth_m
+    if float(depth.max(initial=0.0)) > config.max_depth_m:
+        depth = np.where(depth > config.max_depth_m, np.float32(0), depth)
+    camera = frame.camera
+    levels = []
+    for level in range(config.levels):
+        if level > 0:
+            if min(depth.shape) < 16:
+                break
+            depth, camera = half_size(depth, camera)
+        smooth = bilateral_filter(depth, config) if config.bilateral and level == 0 else depth
+        levels.append(SurfaceLevel(camera, smooth, surface_image(smooth, camera, config)))
+        depth = smooth
+    return SurfacePyramid(frame, tuple(levels))
+
+
+def surface_image(depth_m: Float32, camera: PinholeCamera, config: SurfaceConfig) -> Float32:
+    """Return the surface image (H, W, 8) of a depth image; see :class:`SurfaceLevel`."""
+    if depth_m.shape != camera.shape:
+        raise InvalidInputError(f"depth has shape {depth_m.shape}, the camera {camera.shape}")
+    depth = np.ascontiguousarray(depth_m, dtype=np.float32)
+    surface = np.empty((*depth.shape, 8), np.float32)
+    intrinsics = intrinsics_array(camera)
+    noise, radius, cosine = config.noise, config.normal_radius, np.float32(config.min_cosine)
+
+    def rows(start: int, stop: int) -> None:
+        kernels.surface_rows(start, stop, depth, intrinsics, radius, noise, cosine, surface)
+
+    run_ranges(depth.shape[0], rows)
+    return surface
+
+
+def half_size(depth_m: Float32, camera: PinholeCamera, relative_band: float = 0.03) -> tuple[Float32, PinholeCamera]:
+    """Halve a depth image without averaging across an edge; an odd last row or column is dropped.
+
+    Returns the image (H // 2, W // 2) and its camera, whose pixel centres lie between four of the old ones.
+    """
+    depth = np.ascontiguousarray(depth_m, dtype=np.float32)
+    half = np.empty((depth.shape[0] // 2, depth.shape[1] // 2), np.float32)
+    band = np.float32(relative_band)
+    run_ranges(half.shape[0], lambda start, stop: kernels.halve_depth(start, stop, depth, band, half))
+    smaller = PinholeCamera(
+        camera.fx / 2, camera.fy / 2, (camera.cx + 0.5) / 2 - 0.5, (camera.cy + 0.5) / 2 - 0.5, half.shape[1], half.shape[0]
+    )
+    return half, smaller
+
+
+def bilateral_filter(
+    depth_m: Float32, config: SurfaceConfig | None = None, *, radius: int = 3, space_sigma: float = 2.0
+) -> Float32:
+    """Smooth depth (H, W) [m] where neighbours agree within the noise (Tomasi and Manduchi 1998)."""
+    config = config or SurfaceConfig()
+    depth = np.ascontiguousarray(depth_m, dtype=np.float32)
+    smooth = np.empty_like(depth)
+    noise, sigma, factor = config.noise, np.float32(space_sigma), np.float32(3)
+
+    def rows(start: int, stop: int) -> None:
+        kernels.bilateral_rows(start, stop, depth, radius, sigma, noise, factor, smooth)
+
+    run_ranges(depth.shape[0], rows)
+    return smooth
+
+
+def intrinsics_array(camera: PinholeCamera) -> Float32:
+    """(4,) float32: fx, fy, cx, cy, as kernels take them."""
+    return np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32)

@@ -1,0 +1,42 @@
+"""One RGB-D frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from scanweld.arrays import Float32, UInt8
+from scanweld.errors import InvalidInputError
+from scanweld.geometry.camera import PinholeCamera
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """Registered depth and colour at one moment. It holds no pose: poses are what is estimated.
+
+    Attributes
+    ----------
+    timestamp_s : time [s]
+    depth_m : (H, W) float32, distance along the optical axis [m]; 0 is invalid
+    color : (H, W, 3) uint8 RGB, or None
+    camera : intrinsics of both images
+    """
+
+    timestamp_s: float
+    depth_m: Float32
+    color: UInt8 | None
+    camera: PinholeCamera
+
+    def __post_init__(self) -> None:
+        if self.depth_m.dtype != np.float32:
+            raise InvalidInputError(f"frame: depth_m must be float32 [m], got {self.depth_m.dtype}")
+        if self.depth_m.shape != self.camera.shape:
+            raise InvalidInputError(f"frame: depth has shape {self.depth_m.shape}, the camera {self.camera.shape}")
+        if self.color is not None and (
+            self.color.shape != (*self.camera.shape, 3) or self.color.dtype != np.uint8
+        ):
+            raise InvalidInputError(
+                f"frame: color must be (H, W, 3) uint8 of the size of the depth {self.camera.shape}, "
+                f"got {self.color.shape} {self.color.dtype}"
+            )

@@ -1,0 +1,169 @@
+"""Rigid motions as plain (..., 4, 4) float64 arrays.
+
+Twists are (..., 6) = (rho [m], phi [rad]), translation first; perturbations act from the left,
+T <- exp(xi) T. Every function accepts leading batch dimensions.
+
+Source: J. Solà et al., "A micro Lie theory for state estimation in robotics", 2018 (equations in the code).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from scanweld.arrays import Float64
+
+_SMALL = 1e-4  # below this angle the Taylor series is exact to 1e-16 and the closed form is not
+
+
+def hat(phi: npt.ArrayLike) -> Float64:
+    """Return the skew-symmetric matrices (..., 3, 3) with hat(a) b = a x b of vectors (..., 3)."""
+    v = np.asarray(phi, dtype=np.float64)
+    matrix = np.zeros((*v.shape, 3))
+    matrix[..., 0, 1], matrix[..., 0, 2] = -v[..., 2], v[..., 1]
+    matrix[..., 1, 0], matrix[..., 1, 2] = v[..., 2], -v[..., 0]
+    matrix[..., 2, 0], matrix[..., 2, 1] = -v[..., 1], v[..., 0]
+    return matrix
+
+
+def _coefficients(phi: Float64) -> tuple[Float64, Float64, Float64]:
+    """sin t / t, (1 - cos t) / t^2 and (t - sin t) / t^3 with t = |phi|, shaped (..., 1, 1)."""
+    t = np.linalg.norm(phi, axis=-1)[..., None, None]
+    small = t < _SMALL
+    s = np.where(small, 1.0, t)
+    half = np.sin(s / 2) / s
+    a = np.where(small, 1 - t**2 / 6, np.sin(s) / s)
+    b = np.where(small, 0.5 - t**2 / 24, 2 * half**2)
+    # t - sin t cancels below about 0.01 rad: two more terms of the series there.
+    series = 1 / 6 - t**2 / 120 + t**4 / 5040
+    c = np.where(t < 0.02, series, (s - np.sin(s)) / s**3)
+    return a, b, c
+
+
+def exp_so3(phi: npt.ArrayLike) -> Float64:
+    """Return the rotations (..., 3, 3) about vectors (..., 3) by their length [rad] (Rodrigues)."""
+    v = np.asarray(phi, dtype=np.float64)
+    a, b, _ = _coefficients(v)
+    matrix = hat(v)
+    return np.asarray(np.eye(3) + a * matrix + b * (matrix @ matrix))
+
+
+def log_so3(rotation: npt.ArrayLike) -> Float64:
+    """Return the rotation vectors (..., 3) [rad], angle in [0, pi], of rotations (..., 3, 3)."""
+    q = quaternion_xyzw_from_rotation(rotation)
+    vector, w = q[..., :3], q[..., 3:]
+    sine = np.linalg.norm(vector, axis=-1, keepdims=True)
+    angle = 2 * np.arctan2(sine, w)
+    small = sine < _SMALL
+    factor = np.where(small, 2 + sine**2 / 3, angle / np.where(small, 1.0, sine))
+    return np.asarray(factor * vector)
+
+
+def exp(xi: npt.ArrayLike) -> Float64:
+    """Return the transforms (..., 4, 4) of twists (..., 6) (Solà eq. 172, 174)."""
+    twist = np.asarray(xi, dtype=np.float64)
+    rho, phi = twist[..., :3], twist[..., 3:]
+    a, b, c = _coefficients(phi)
+    matrix = hat(phi)
+    square = matrix @ matrix
+    transform = np.zeros((*twist.shape[:-1], 4, 4))
+    transform[..., :3, :3] = np.eye(3) + a * matrix + b * square
+    transform[..., :3, 3] = ((np.eye(3) + b * matrix + c * square) @ rho[..., None])[..., 0]
+    transform[..., 3, 3] = 1
+    return transform
+
+
+def log(transform: npt.ArrayLike) -> Float64:
+    """Return the twists (..., 6) of transforms (..., 4, 4) (Solà eq. 173); rotation angle in [0, pi]."""
+    T = np.asarray(transform, dtype=np.float64)
+    phi = log_so3(T[..., :3, :3])
+    angle = np.linalg.norm(phi, axis=-1)[..., None, None]
+    small = angle < 0.02
+    s = np.where(small, 1.0, angle)
+    # V^-1 = I - hat/2 + k hat^2, k = (1 - (t/2) cot(t/2)) / t^2 (Solà eq. 146)
+    with np.errstate(divide="ignore"):
+        cotangent = 1 / np.tan(s / 2)
+    k = np.where(small, 1 / 12 + angle**2 / 720 + angle**4 / 30240, (1 - s / 2 * cotangent) / s**2)
+    matrix = hat(phi)
+    rho = (np.eye(3) - matrix / 2 + k * (matrix @ matrix)) @ T[..., :3, 3, None]
+    return np.concatenate([rho[..., 0], phi], axis=-1)
+
+
+def inverse(transform: npt.ArrayLike) -> Float64:
+    """Return T^-1 of rigid transforms (..., D + 1, D + 1), any D, by transposing the rotation."""
+    T = np.asarray(transform, dtype=np.float64)
+    d = T.shape[-1] - 1
+    result = np.zeros_like(T)
+    rotation = np.swapaxes(T[..., :d, :d], -1, -2)
+    result[..., :d, :d] = rotation
+    result[..., :d, d] = -(rotation @ T[..., :d, d, None])[..., 0]
+    result[..., d, d] = 1
+    return result
+
+
+def adjoint(transform: npt.ArrayLike) -> Float64:
+    """Return Ad (..., 6, 6) with T exp(xi) = exp(Ad xi) T (Solà eq. 175)."""
+    T = np.asarray(transform, dtype=np.float64)
+    rotation = T[..., :3, :3]
+    result = np.zeros((*T.shape[:-2], 6, 6))
+    result[..., :3, :3] = rotation
+    result[..., 3:, 3:] = rotation
+    result[..., :3, 3:] = hat(T[..., :3, 3]) @ rotation
+    return result
+
+
+def interpolate(T_a: npt.ArrayLike, T_b: npt.ArrayLike, fraction: npt.ArrayLike) -> Float64:
+    """Move from T_a (fraction 0) to T_b (fraction 1) at constant twist; other fractions extrapolate.
+
+    Shapes (..., 4, 4), (..., 4, 4) and (...) broadcast.
+    """
+    a, b = np.asarray(T_a, dtype=np.float64), np.asarray(T_b, dtype=np.float64)
+    s = np.asarray(fraction, dtype=np.float64)
+    return np.asarray(exp(s[..., None] * log(b @ inverse(a))) @ a)
+
+
+def transform_points(transform: npt.ArrayLike, points: npt.ArrayLike) -> Float64:
+    """Apply one rigid transform (D + 1, D + 1) to points (..., D)."""
+    T, p = np.asarray(transform, dtype=np.float64), np.asarray(points, dtype=np.float64)
+    d = T.shape[-1] - 1
+    return np.asarray(p @ T[:d, :d].T + T[:d, d])
+
+
+def rotation_angle_rad(transform: npt.ArrayLike) -> Float64:
+    """Return the rotation angles (...) [rad] of transforms (..., 4, 4) or rotations (..., 3, 3)."""
+    T = np.asarray(transform, dtype=np.float64)
+    return np.asarray(np.linalg.norm(log_so3(T[..., :3, :3]), axis=-1))
+
+
+def from_quaternion_xyzw(quaternion_xyzw: npt.ArrayLike, translation_m: npt.ArrayLike = (0, 0, 0)) -> Float64:
+    """Return transforms (..., 4, 4) from quaternions (..., 4), normalised here, and translations (..., 3)."""
+    q = np.asarray(quaternion_xyzw, dtype=np.float64)
+    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    x, y, z, w = np.moveaxis(q, -1, 0)
+    T = np.zeros((*q.shape[:-1], 4, 4))
+    T[..., 0, 0], T[..., 0, 1], T[..., 0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)
+    T[..., 1, 0], T[..., 1, 1], T[..., 1, 2] = 2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)
+    T[..., 2, 0], T[..., 2, 1], T[..., 2, 2] = 2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)
+    T[..., :3, 3] = translation_m
+    T[..., 3, 3] = 1
+    return T
+
+
+def quaternion_xyzw_from_rotation(rotation: npt.ArrayLike) -> Float64:
+    """Return unit quaternions (..., 4) with w >= 0 of rotations (..., 3, 3) (Shepperd: largest component first)."""
+    R = np.asarray(rotation, dtype=np.float64)
+    m00, m11, m22 = R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]
+    # Row k is 4 q_k q: all four are the same quaternion, the one with the largest q_k is well conditioned.
+    rows = np.stack(
+        [
+            np.stack([1 + m00 - m11 - m22, R[..., 0, 1] + R[..., 1, 0], R[..., 0, 2] + R[..., 2, 0], R[..., 2, 1] - R[..., 1, 2]], -1),
+            np.stack([R[..., 0, 1] + R[..., 1, 0], 1 - m00 + m11 - m22, R[..., 1, 2] + R[..., 2, 1], R[..., 0, 2] - R[..., 2, 0]], -1),
+            np.stack([R[..., 0, 2] + R[..., 2, 0], R[..., 1, 2] + R[..., 2, 1], 1 - m00 - m11 + m22, R[..., 1, 0] - R[..., 0, 1]], -1),
+            np.stack([R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1], 1 + m00 + m11 + m22], -1),
+        ],
+        axis=-2,
+    )  # fmt: skip
+    largest = np.argmax(np.diagonal(rows, axis1=-2, axis2=-1), axis=-1)
+    q = np.take_along_axis(rows, largest[..., None, None], axis=-2)[..., 0, :]
+    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    return np.asarray(np.where(q[..., 3:] < 0, -q, q))

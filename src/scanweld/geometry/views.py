@@ -1,0 +1,49 @@
+"""What crosses between mapping, tracking and loop closure: the map seen from a pose, and a change of its frames."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from scanweld.arrays import Float32, Float64, Int32
+from scanweld.geometry.camera import PinholeCamera
+
+
+@dataclass(frozen=True, slots=True)
+class ModelView:
+    """The surfels that a camera sees, one at most per pixel, as rows of equal length N.
+
+    Rows are in the order of the pixels (row-major), so a strided subset is spread over the image.
+
+    Attributes
+    ----------
+    T_world_camera : (4, 4), where the map was looked at from
+    camera : the intrinsics it was looked at with
+    positions_m : (3, N) float32, world frame [m]
+    normals : (3, N) float32, world frame, unit, towards the camera
+    confidences : (N,) float32
+    index_map : (H, W) int32, the surfel behind each pixel, -1 where none
+    """
+
+    T_world_camera: Float64
+    camera: PinholeCamera
+    positions_m: Float32
+    normals: Float32
+    confidences: Float32
+    index_map: Int32
+
+    def __len__(self) -> int:
+        return int(self.positions_m.shape[1])
+
+
+@dataclass(frozen=True, slots=True)
+class MapCorrection:
+    """How the frames of keyframes moved when a loop was closed.
+
+    Attributes
+    ----------
+    keyframe_ids : (K,) int32
+    T_new_old : (K, 4, 4), maps old world coordinates of what is anchored to a keyframe to new ones
+    """
+
+    keyframe_ids: Int32
+    T_new_old: Float64
