@@ -1,0 +1,208 @@
+"""Projective point-to-plane alignment of points against a depth image, coarse to fine.
+
+Correspondence by projection (Blais and Levine 1995), point-to-plane distance (Chen and Medioni 1991), linearised and
+solved by Gauss-Newton with Huber weights on residuals in units of the depth noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from scanweld.arrays import Float32, Float64
+from scanweld.config import check_ranges, setting
+from scanweld.geometry import se3
+from scanweld.geometry.depth import SurfaceLevel, intrinsics_array
+from scanweld.parallel import run_ranges
+from scanweld.registration import kernels
+from scanweld.registration.gauss_newton import NormalEquations, Spectrum, free_directions, solve, spectrum
+from scanweld.registration.result import FreeDirection, RegistrationResult, Status
+from scanweld.registration.verification import Agreement, check_against_depth
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ProjectiveConfig:
+    """Schedule and gates of the projective aligner."""
+
+    iterations: int = setting(10, "most iterations on each pyramid level; raise for fast motion", low=1, high=1000)
+    coarse_gate_m: float = setting(0.25, "largest distance of a match on the coarsest level [m]; raise for fast motion, lower for clutter", low=1e-3)
+    fine_gate_m: float = setting(0.05, "largest distance of a match on the finest level [m]; lower for clutter, raise for noise", low=1e-3)
+    min_cosine: float = setting(0.7, "matched normals agree at least this well; lower for noise", low=-1.0, high=1.0)
+    robust_sigma: float = setting(2.0, "Huber threshold in standard deviations of the depth noise; lower for outliers", low=0.1)
+    max_points: int = setting(80_000, "source points on the finest level; a quarter on each coarser; raise for accuracy, costs time", low=100)
+    min_points: int = setting(200, "fewer matches than this give no answer", low=12)
+    min_overlap: float = setting(0.05, "smaller shares of matched points give no answer", low=0.0, high=1.0)
+    min_agreement: float = setting(0.5, "share of the compared points that agree with the depth in a trusted answer", low=0.0, high=1.0)
+    max_conflict: float = setting(0.3, "share of the compared points in front of the depth in a trusted answer", low=0.0, high=1.0)
+    step_m: float = setting(1e-4, "converged when a step moves the points less than this [m]", low=0.0)
+
+    def __post_init__(self) -> None:
+        check_ranges(self)
+
+
+@dataclass(frozen=True, slots=True)
+class ProjectiveStep:
+    """Sums of one iteration; residuals in standard deviations of the depth noise."""
+
+    level: int
+    equations: NormalEquations
+    loss: float
+    rmse_m: float
+    num_inliers: int
+    num_matched: int
+    num_projected: int
+
+
+def projective_step(
+    positions_m: Float32,
+    normals: Float32,
+    T_target_source: Float64,
+    target: SurfaceLevel,
+    gate_m: float,
+    config: ProjectiveConfig,
+    centroid_m: Float64,
+    radius_m: float,
+    level: int = 0,
+) -> ProjectiveStep:
+    """Match source points by projection into `target` and sum the point-to-plane normal equations.
+
+    Parameters
+    ----------
+    positions_m, normals : (3, N) float32, source frame
+    T_target_source : (4, 4), where the linearisation happens
+    target : the image that is projected into, target frame = its camera's
+    gate_m : largest distance of a correspondence [m]
+    centroid_m, radius_m : of the source points in the target frame, for :class:`NormalEquations`
+    """
+    chunks = -(-positions_m.shape[1] // kernels.CHUNK)
+    partials = np.empty((chunks, kernels.SUMS))
+    transform = T_target_source[:3].astype(np.float32)
+    surface = target.surface.reshape(-1, 8)
+    intrinsics = intrinsics_array(target.camera)
+    height, width = target.camera.shape
+    gate, cosine, robust = np.float32(gate_m), np.float32(config.min_cosine), np.float32(config.robust_sigma)
+
+    def body(start: int, stop: int) -> None:
+        kernels.point_to_plane_sums(
+            start, stop, positions_m, normals, transform, surface, intrinsics, width, height, gate, cosine, robust, partials
+        )
+
+    run_ranges(chunks, body)
+    sums = partials.sum(axis=0)
+    full = np.zeros((7, 7))
+    full[np.triu_indices(7)] = sums[:28]
+    information = full[:6, :6] + np.triu(full[:6, :6], 1).T
+    # Unit normals: the translation block's trace is the sum of the weights w / sigma^2.
+    weight = float(np.trace(information[:3, :3]))
+    matched = int(sums[30])
+    return ProjectiveStep(
+        level,
+        NormalEquations(information, full[:6, 6], weight, centroid_m, radius_m),
+        loss=float(sums[28] / matched) if matched else 0.0,
+        rmse_m=float(np.sqrt(max(full[6, 6], 0.0) / weight)) if weight > 0 else 0.0,
+        num_inliers=int(sums[29]),
+        num_matched=matched,
+        num_projected=int(sums[31]),
+    )
+
+
+def align_projective(
+    positions_m: Float32,
+    normals: Float32,
+    target: Sequence[SurfaceLevel],
+    T_target_source: Float64,
+    config: ProjectiveConfig | None = None,
+    *,
+    keep_history: bool = False,
+) -> RegistrationResult:
+    """Align source points with a target pyramid from an initial guess.
+
+    Parameters
+    ----------
+    positions_m, normals : (3, N) float32, source frame, normals towards the viewer
+    target : pyramid, finest level first
+    T_target_source : (4, 4) initial guess
+    keep_history : put the :class:`ProjectiveStep` of every iteration into the result
+
+    The answer is checked against the free space of the target (:func:`~.verification.check_against_depth`): a
+    minimum that contradicts what the target saw is no answer, however small its residuals are.
+    """
+    config = config or ProjectiveConfig()
+    T = np.array(T_target_source, dtype=np.float64)
+    coarsest = len(target) - 1
+    history: list[ProjectiveStep] = []
+    parts: Spectrum | None = None
+    converged = False
+    source, directions = positions_m, normals
+    for level in range(coarsest, -1, -1):
+        stride = max(1, -(-positions_m.shape[1] // max(config.min_points, config.max_points >> (2 * level))))
+        source, directions = positions_m[:, ::stride].copy(), normals[:, ::stride].copy()
+        centroid, radius = _centroid_and_radius(se3.transform_points(T, source[:, :: max(1, source.shape[1] // 1000)].T))
+        gate = config.fine_gate_m * (config.coarse_gate_m / config.fine_gate_m) ** (level / max(coarsest, 1))
+        converged = False
+        for _ in range(config.iterations):
+            step = projective_step(source, directions, T, target[level], gate, config, centroid, radius, level)
+            history.append(step)
+            if step.num_matched < max(6, config.min_points >> (2 * level)):
+                break
+            parts = spectrum(step.equations)
+            xi = solve(step.equations, parts)
+            T = se3.exp(xi) @ T
+            motion = float(np.linalg.norm(xi[:3] + np.cross(xi[3:], centroid)) + radius * np.linalg.norm(xi[3:]))
+            # A coarse level need only hand over a start within its pixel size.
+            if motion < config.step_m * 4**level:
+                converged = True
+                break
+    agreement = check_against_depth(source, directions, T, target[0])
+    last = history[-1]
+    overlap = last.num_matched / max(1, source.shape[1])
+    free = free_directions(last.equations, parts) if parts is not None and last.num_matched >= 6 else ()
+    status, note = _judge(last, overlap, agreement, free, converged, len(history), config)
+    return RegistrationResult(
+        T_target_source=T,
+        status=status,
+        information=last.equations.information,
+        num_iterations=len(history),
+        num_inliers=last.num_inliers,
+        overlap=overlap,
+        rmse_m=last.rmse_m,
+        loss=last.loss,
+        unobservable=free,
+        note=note,
+        history=tuple(history) if keep_history else (),
+    )
+
+
+def _centroid_and_radius(points_m: Float64) -> tuple[Float64, float]:
+    if len(points_m) == 0:
+        return np.zeros(3), 1.0
+    centroid = points_m.mean(axis=0)
+    return centroid, float(np.sqrt(((points_m - centroid) ** 2).sum(axis=1).mean()))
+
+
+def _judge(
+    last: ProjectiveStep,
+    overlap: float,
+    agreement: Agreement,
+    free: tuple[FreeDirection, ...],
+    converged: bool,
+    iterations: int,
+    config: ProjectiveConfig,
+) -> tuple[Status, str]:
+    """Say what the end of the iterations is worth, and why."""
+    if last.num_matched < config.min_points:
+        return Status.TOO_FEW_CORRESPONDENCES, f"{last.num_matched} matches, fewer than {config.min_points}"
+    if overlap < config.min_overlap:
+        return Status.NO_OVERLAP, f"only {overlap:.0%} of the points match"
+    if agreement.agree < config.min_agreement or agreement.conflict > config.max_conflict:
+        return Status.NO_OVERLAP, (
+            f"only {agreement.agree:.0%} of the points agree with the depth, "
+            f"{agreement.conflict:.0%} would stand in free space"
+        )
+    if free:
+        return Status.DEGENERATE, "free: " + "; ".join(direction.words for direction in free)
+    if not converged:
+        return Status.MAX_ITERATIONS, f"still moving after {iterations} iterations"
+    return Status.CONVERGED, ""

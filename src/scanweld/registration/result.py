@@ -1,0 +1,81 @@
+"""The one result type of every aligner, from Horn to the tracker."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any
+
+from scanweld.arrays import Float64
+
+
+class Status(Enum):
+    """Whether an alignment can be trusted. Only CONVERGED is a success."""
+
+    CONVERGED = "converged"
+    MAX_ITERATIONS = "max_iterations"
+    TOO_FEW_CORRESPONDENCES = "too_few_correspondences"
+    DEGENERATE = "degenerate"
+    NO_OVERLAP = "no_overlap"
+
+    @property
+    def success(self) -> bool:
+        """Whether the transform may be used without looking further."""
+        return self is Status.CONVERGED
+
+    @property
+    def rank(self) -> int:
+        """Higher is more of an answer; for choosing among attempts."""
+        return (
+            Status.TOO_FEW_CORRESPONDENCES, Status.NO_OVERLAP, Status.DEGENERATE, Status.MAX_ITERATIONS, Status.CONVERGED
+        ).index(self)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class FreeDirection:
+    """A motion that the data does not constrain.
+
+    Attributes
+    ----------
+    words : what a person would call it, e.g. "translation along (0.00, 1.00, 0.00)"
+    vector : the unit twist; (6,) = (rho, phi) in 3-D, (3,) = (rho, phi) in 2-D, about the points' centroid
+    """
+
+    words: str
+    vector: Float64
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RegistrationResult:
+    """An alignment and what it is worth.
+
+    Attributes
+    ----------
+    T_target_source : (D + 1, D + 1), maps source points to the target frame: x_target = scale R x + t
+    status : see :class:`Status`
+    scale : 1 unless scale was estimated; never hidden in the matrix
+    num_iterations : iterations done
+    num_inliers : correspondences that the last step used
+    overlap : share of the source points with an accepted correspondence, 0..1
+    rmse_m : root mean square residual of the inliers, in the metric that was minimised [m]
+    loss : mean robust loss of the correspondences at the last step, residuals in units of their noise (where the
+        aligner has a noise model, else 0)
+    information : (6, 6) in 3-D, (3, 3) in 2-D; the Gauss-Newton Hessian of the metric that was minimised [1/m^2,
+        1/(m rad), 1/rad^2 times the weight's unit], translation first, left perturbation at the target's origin
+    unobservable : directions that the data leaves free; they stay at the initial guess
+    note : one sentence for a person where the status is not CONVERGED, else ""
+    history : the steps, where asked for
+    """
+
+    T_target_source: Float64
+    status: Status
+    information: Float64
+    scale: float = 1.0
+    num_iterations: int = 0
+    num_inliers: int = 0
+    overlap: float = 0.0
+    rmse_m: float = 0.0
+    loss: float = 0.0
+    unobservable: tuple[FreeDirection, ...] = ()
+    note: str = ""
+    history: tuple[Any, ...] = ()

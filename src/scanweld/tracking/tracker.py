@@ -1,0 +1,67 @@
+"""Frame-to-model tracking: the map's surfels are the source, the frame is the target."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from scanweld.arrays import Float32, Float64
+from scanweld.config import check_ranges, section, setting
+from scanweld.geometry import se3
+from scanweld.geometry.depth import SurfacePyramid
+from scanweld.geometry.views import ModelView
+from scanweld.registration.projective import ProjectiveConfig, align_projective
+from scanweld.registration.result import RegistrationResult
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrackingConfig:
+    """How a frame is aligned with the map."""
+
+    stable_fraction: float = setting(1.0, "track against this share of the visible surfels, the most stable ones; lower it against drift and for speed", low=0.001, high=1.0)
+    projective: ProjectiveConfig = section(ProjectiveConfig, "schedule and gates of the alignment")
+
+    def __post_init__(self) -> None:
+        check_ranges(self)
+
+
+class FrameToModelTracker:
+    """Coarse-to-fine projective point-to-plane alignment of a frame with the map."""
+
+    def __init__(self, config: TrackingConfig | None = None) -> None:
+        self.config = config or TrackingConfig()
+
+    def track(self, pyramid: SurfacePyramid, view: ModelView, T_world_camera: Float64) -> RegistrationResult:
+        """Align a frame with the map seen from close by.
+
+        Parameters
+        ----------
+        pyramid : the frame
+        view : the map as seen from about `T_world_camera`
+        T_world_camera : (4, 4), predicted pose
+
+        Returns
+        -------
+        The result of moving the camera: T_target_source is T_world_camera.
+        """
+        positions, normals = self._select(view)
+        result = align_projective(
+            positions, normals, pyramid.levels, se3.inverse(T_world_camera), self.config.projective
+        )
+        # The aligner moves the map to the camera: T_cw <- exp(xi) T_cw. With T_wc <- exp(eta) T_wc, xi = -Ad(T_cw) eta.
+        adjoint = se3.adjoint(result.T_target_source)
+        return replace(
+            result,
+            T_target_source=se3.inverse(result.T_target_source),
+            information=adjoint.T @ result.information @ adjoint,
+        )
+
+    def _select(self, view: ModelView) -> tuple[Float32, Float32]:
+        """Return the positions and normals of the most stable share of the visible surfels."""
+        wanted = round(self.config.stable_fraction * len(view))
+        if wanted >= len(view) or wanted < self.config.projective.min_points:
+            return view.positions_m, view.normals
+        # Ties at the limit are broken by the place in the image, which stays spread: a stable sort does that.
+        chosen = np.sort(np.argsort(-view.confidences, kind="stable")[:wanted])
+        return np.ascontiguousarray(view.positions_m[:, chosen]), np.ascontiguousarray(view.normals[:, chosen])
