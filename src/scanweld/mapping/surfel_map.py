@@ -1,0 +1,180 @@
+"""Storage of surfels, and nothing else: structure of arrays, doubling capacity, a handful of mutators."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from scanweld.arrays import Array, Bool, Float32, Int32, UInt8
+from scanweld.errors import InvalidInputError
+from scanweld.geometry.views import MapCorrection
+
+_COLUMNS: tuple[tuple[str, int, type], ...] = (
+    ("positions", 3, np.float32),
+    ("normals", 3, np.float32),
+    ("colors", 3, np.float32),
+    ("radii", 1, np.float32),
+    ("confidences", 1, np.float32),
+    ("created", 1, np.int32),
+    ("last_seen", 1, np.int32),
+    ("anchors", 1, np.int32),
+)
+
+
+@dataclass(slots=True)
+class SurfelArrays:
+    """The arrays themselves, longer than the map; only mapping code sees them.
+
+    positions, normals (3, capacity) float32, world frame; colors (3, capacity) float32, RGB 0..255; radii [m],
+    confidences (capacity,) float32; created, last_seen (capacity,) int32, frame numbers; anchors (capacity,) int32,
+    keyframe numbers.
+    """
+
+    positions: Float32
+    normals: Float32
+    colors: Float32
+    radii: Float32
+    confidences: Float32
+    created: Int32
+    last_seen: Int32
+    anchors: Int32
+
+    @classmethod
+    def empty(cls, capacity: int) -> SurfelArrays:
+        """Allocate arrays for `capacity` surfels."""
+        return cls(*(np.zeros((rows, capacity) if rows > 1 else capacity, kind) for _, rows, kind in _COLUMNS))
+
+
+class SurfelMap:
+    """A growing set of oriented discs with colour and confidence.
+
+    Properties return read-only views of the live surfels; they are valid until the map is changed.
+    """
+
+    def __init__(self, capacity: int = 1 << 16) -> None:
+        self._arrays = SurfelArrays.empty(max(16, capacity))
+        self._count = 0
+
+    def __len__(self) -> int:
+        return self._count
+
+    @property
+    def positions_m(self) -> Float32:
+        """(3, N) float32, world frame [m]."""
+        return self._view("positions")
+
+    @property
+    def normals(self) -> Float32:
+        """(3, N) float32, world frame, unit."""
+        return self._view("normals")
+
+    @property
+    def colors(self) -> UInt8:
+        """(3, N) uint8, RGB (a rounded copy; the map keeps fractions)."""
+        return np.clip(np.rint(self._view("colors")), 0, 255).astype(np.uint8)
+
+    @property
+    def radii_m(self) -> Float32:
+        """(N,) float32 [m]."""
+        return self._view("radii")
+
+    @property
+    def confidences(self) -> Float32:
+        """(N,) float32, sum of the measurements' weights."""
+        return self._view("confidences")
+
+    @property
+    def created(self) -> Int32:
+        """(N,) int32, number of the frame that made the surfel."""
+        return self._view("created")
+
+    @property
+    def last_seen(self) -> Int32:
+        """(N,) int32, number of the frame that last confirmed the surfel."""
+        return self._view("last_seen")
+
+    @property
+    def anchors(self) -> Int32:
+        """(N,) int32, keyframe that the surfel moves with."""
+        return self._view("anchors")
+
+    @property
+    def arrays(self) -> SurfelArrays:
+        """The storage, for the kernels of fusion and rendering: only the first ``len(map)`` columns are surfels."""
+        return self._arrays
+
+    def reserve(self, more: int) -> SurfelArrays:
+        """Make room for `more` surfels behind the live ones and return the storage."""
+        needed, capacity = self._count + more, self._arrays.radii.shape[0]
+        if needed > capacity:
+            while capacity < needed:
+                capacity *= 2
+            grown = SurfelArrays.empty(capacity)
+            for name, _, _ in _COLUMNS:
+                getattr(grown, name)[..., : self._count] = getattr(self._arrays, name)[..., : self._count]
+            self._arrays = grown
+        return self._arrays
+
+    def extend(self, more: int, anchor: int = 0) -> None:
+        """Count `more` surfels that a kernel wrote behind the live ones, anchored to a keyframe."""
+        if not 0 <= more <= self._arrays.radii.shape[0] - self._count:
+            raise InvalidInputError(f"map: cannot extend by {more}, reserve first")
+        self._arrays.anchors[self._count : self._count + more] = anchor
+        self._count += more
+
+    def append(
+        self,
+        positions_m: Float32,
+        normals: Float32,
+        colors: Array,
+        radii_m: Float32,
+        confidences: Float32,
+        frame_id: int,
+        anchor: int = 0,
+    ) -> None:
+        """Add surfels: positions, normals, colors (3, M), radii and confidences (M,)."""
+        more = len(radii_m)
+        arrays = self.reserve(more)
+        new = slice(self._count, self._count + more)
+        arrays.positions[:, new], arrays.normals[:, new], arrays.colors[:, new] = positions_m, normals, colors
+        arrays.radii[new], arrays.confidences[new] = radii_m, confidences
+        arrays.created[new] = arrays.last_seen[new] = frame_id
+        self.extend(more, anchor)
+
+    def remove(self, doomed: Bool) -> int:
+        """Drop the surfels where `doomed` (N,) is true, keeping the order of the others; returns how many went."""
+        if doomed.shape != (self._count,):
+            raise InvalidInputError(f"map: expected a mask of shape ({self._count},), got {doomed.shape}")
+        gone = int(np.count_nonzero(doomed))
+        if gone == 0:
+            return 0
+        # Columns before the first doomed one stay where they are: late removals move little.
+        first = int(np.argmax(doomed))
+        kept = first + np.flatnonzero(~doomed[first:])
+        for name, _, _ in _COLUMNS:
+            column = getattr(self._arrays, name)
+            column[..., first : first + len(kept)] = column[..., kept]
+        self._count -= gone
+        return gone
+
+    def apply_correction(self, correction: MapCorrection) -> None:
+        """Move the surfels of each named keyframe by its T_new_old."""
+        for keyframe, T in zip(correction.keyframe_ids, correction.T_new_old, strict=True):
+            mine = np.flatnonzero(self.anchors == keyframe)
+            rotation, translation = T[:3, :3], T[:3, 3, None]
+            self._arrays.positions[:, mine] = rotation @ self._arrays.positions[:, mine] + translation
+            self._arrays.normals[:, mine] = rotation @ self._arrays.normals[:, mine]
+
+    def columns(self) -> dict[str, Array]:
+        """Return the map as named columns, in the order of the PLY file."""
+        p, n, c = self.positions_m, self.normals, self.colors
+        return {
+            "x": p[0], "y": p[1], "z": p[2], "nx": n[0], "ny": n[1], "nz": n[2],
+            "red": c[0], "green": c[1], "blue": c[2], "radius": self.radii_m, "confidence": self.confidences,
+        }  # fmt: skip
+
+    def _view(self, name: str) -> Array:
+        view: Array = getattr(self._arrays, name)[..., : self._count]
+        view.flags.writeable = False
+        return view
