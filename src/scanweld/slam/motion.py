@@ -1,0 +1,63 @@
+"""Where the camera is expected next, and where it was while nobody saw it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from scanweld.arrays import Float64
+from scanweld.geometry import se3
+from scanweld.trajectory import FrameResult, FrameState, Trajectory
+
+POSED = (FrameState.TRACKING, FrameState.RELOCALISED)
+"""States whose pose was measured."""
+
+
+class ConstantVelocity:
+    """Predicts that the camera goes on as it last moved; without measurements it slows down and stops."""
+
+    def __init__(self, decay: float = 0.8) -> None:
+        self.decay = decay
+        self._T_world_camera: Float64 = np.eye(4)
+        self._timestamp_s: float | None = None
+        self._velocity: Float64 = np.zeros(6)  # twist per second, in the camera's own frame
+
+    def predict(self, timestamp_s: float) -> Float64:
+        """Return T_world_camera (4, 4) at a time."""
+        if self._timestamp_s is None:
+            return self._T_world_camera.copy()
+        elapsed = timestamp_s - self._timestamp_s
+        return np.asarray(self._T_world_camera @ se3.exp(self._velocity * elapsed))
+
+    def observe(self, timestamp_s: float, T_world_camera: Float64) -> None:
+        """Take in a measured pose."""
+        if self._timestamp_s is not None and timestamp_s > self._timestamp_s:
+            step = se3.inverse(self._T_world_camera) @ T_world_camera
+            self._velocity = se3.log(step) / (timestamp_s - self._timestamp_s)
+        self._T_world_camera, self._timestamp_s = T_world_camera, timestamp_s
+
+    def miss(self, timestamp_s: float) -> Float64:
+        """Go on without a measurement, slower each time; returns T_world_camera (4, 4)."""
+        T_world_camera = self.predict(timestamp_s)
+        self._T_world_camera, self._timestamp_s = T_world_camera, timestamp_s
+        self._velocity = self._velocity * self.decay
+        return T_world_camera
+
+
+def trajectory_of(results: Sequence[FrameResult], *, tracked_only: bool = False) -> Trajectory:
+    """Return one pose per frame; unmeasured poses between two measured ones are interpolated in time.
+
+    With `tracked_only` the unmeasured frames are left out.
+    """
+    if tracked_only:
+        results = [result for result in results if result.state in POSED]
+    times = np.array([result.timestamp_s for result in results], np.float64)
+    poses = np.array([result.T_world_camera for result in results], np.float64).reshape(-1, 4, 4)
+    measured = np.array([k for k, result in enumerate(results) if result.state in POSED], np.int64)
+    for before, after in zip(measured[:-1], measured[1:], strict=True):
+        if after - before > 1:
+            inner = slice(before + 1, after)
+            fraction = (times[inner] - times[before]) / (times[after] - times[before])
+            poses[inner] = se3.interpolate(poses[before], poses[after], fraction)
+    return Trajectory(times, poses)
