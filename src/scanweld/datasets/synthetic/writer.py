@@ -1,0 +1,126 @@
+"""Write a rendered sequence in the layout of TUM RGB-D."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+
+from scanweld.arrays import Array
+from scanweld.datasets.synthetic.sequence import DEPTH_SCALE, RenderConfig, SyntheticSequence
+from scanweld.errors import OutputError
+from scanweld.geometry.camera import PinholeCamera
+from scanweld.io.trajectory_files import write_tum
+
+_PNG_COMPRESSION = 1  # fast; renders compress well anyway
+
+
+def render_sequence(
+    folder: str | os.PathLike[str],
+    config: RenderConfig | None = None,
+    *,
+    force: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+) -> SyntheticSequence:
+    """Render a sequence into a folder: TUM RGB-D layout, exact ground truth, `camera.json`.
+
+    The folder holds `rgb/*.png`, `depth/*.png` (16 bits, 5000 = 1 m, 0 invalid), `rgb.txt`, `depth.txt`,
+    `associations.txt`, `groundtruth.txt` and `camera.json`. It is complete or absent: it is written aside and
+    renamed.
+
+    Parameters
+    ----------
+    folder : where to
+    config : what to render
+    force : replace a folder that holds something
+    progress : called with (frames done, frames in all) after every frame
+
+    Raises
+    ------
+    OutputError
+        When the folder holds something and `force` is not given, or it cannot be written.
+    """
+    target = Path(folder)
+    _refuse_to_overwrite(target, force)
+    sequence = SyntheticSequence(config)
+    with _written_aside(target) as aside:
+        _write_frames(aside, sequence, progress)
+        write_tum(aside / "groundtruth.txt", sequence.ground_truth)
+        _write_camera(aside / "camera.json", sequence.camera)
+    return sequence
+
+
+def _refuse_to_overwrite(target: Path, force: bool) -> None:
+    if target.exists() and not target.is_dir():
+        raise OutputError(f"{target}: exists and is no folder")
+    if target.is_dir() and any(target.iterdir()):
+        if not force:
+            raise OutputError(f"{target}: exists and is not empty; --force replaces it")
+        if not (target / "rgb.txt").is_file() or not (target / "depth.txt").is_file():
+            raise OutputError(f"{target}: holds something else than a sequence; it is not replaced")
+
+
+def _write_frames(
+    folder: Path, sequence: SyntheticSequence, progress: Callable[[int, int], None] | None
+) -> None:
+    """Write the images and the lists that name them."""
+    stamps = [f"{time:.6f}" for time in sequence.timestamps_s]
+    lists = {
+        "rgb.txt": ["# timestamp filename", *(f"{s} rgb/{s}.png" for s in stamps)],
+        "depth.txt": ["# timestamp filename", *(f"{s} depth/{s}.png" for s in stamps)],
+        "associations.txt": [f"{s} rgb/{s}.png {s} depth/{s}.png" for s in stamps],
+    }
+    for name, lines in lists.items():
+        (folder / name).write_text("\n".join(lines) + "\n", encoding="ascii")
+    (folder / "rgb").mkdir()
+    (folder / "depth").mkdir()
+    for index, stamp in enumerate(stamps):
+        color, depth = sequence.read_stored(index)
+        _write_png(
+            folder / "rgb" / f"{stamp}.png", np.ascontiguousarray(color[..., ::-1])
+        )  # OpenCV wants BGR
+        _write_png(folder / "depth" / f"{stamp}.png", depth)
+        if progress is not None:
+            progress(index + 1, len(stamps))
+
+
+def _write_png(path: Path, image: Array) -> None:
+    import cv2
+
+    done, data = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, _PNG_COMPRESSION])
+    if not done:
+        raise OutputError(f"{path}: the image cannot be encoded as PNG")
+    path.write_bytes(data.tobytes())
+
+
+def _write_camera(path: Path, camera: PinholeCamera) -> None:
+    values = {
+        "fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy,
+        "width": camera.width, "height": camera.height, "depth_scale": DEPTH_SCALE,
+    }  # fmt: skip
+    path.write_text(json.dumps(values, indent=2) + "\n", encoding="ascii")
+
+
+@contextlib.contextmanager
+def _written_aside(target: Path) -> Iterator[Path]:
+    """Give a new folder beside `target` that takes its place at the end, or vanishes on an error."""
+    place = target.absolute()
+    aside = place.with_name(f".{place.name}.{os.getpid()}.tmp")
+    replaced = place.with_name(f".{place.name}.{os.getpid()}.old")
+    try:
+        aside.parent.mkdir(parents=True, exist_ok=True)
+        aside.mkdir()
+        yield aside
+        if target.is_dir():  # the old one goes away only once the new one is in its place
+            os.replace(target, replaced)
+        os.replace(aside, target)
+    except OSError as error:
+        raise OutputError(f"{target}: cannot be written: {error.strerror or error}") from None
+    finally:
+        shutil.rmtree(aside, ignore_errors=True)
+        shutil.rmtree(replaced, ignore_errors=True)
