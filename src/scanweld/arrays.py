@@ -65,21 +65,35 @@ def as_transform(transform: npt.ArrayLike, name: str = "T", *, dimension: int = 
         When the shape is wrong, a value is not finite, the last row is not (0, .., 0, 1), or the upper left
         block is further than ``ROTATION_TOLERANCE`` from a rotation (a reflection and a scale are refused).
     """
-    array = np.array(transform, dtype=np.float64)
+    array = np.asarray(transform, dtype=np.float64)
     size = dimension + 1
     if array.shape != (size, size):
         raise InvalidInputError(f"{name}: expected shape ({size}, {size}), got {array.shape}")
-    if not np.isfinite(array).all():
-        raise InvalidInputError(f"{name}: has values that are not finite")
-    if not np.allclose(array[-1], np.eye(size)[-1], atol=1e-9):
-        raise InvalidInputError(f"{name}: the last row must be (0, .., 0, 1), got {array[-1].tolist()}")
-    rotation = array[:dimension, :dimension]
-    defect = float(np.abs(rotation.T @ rotation - np.eye(dimension)).max())
-    if defect > ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
-        raise InvalidInputError(
-            f"{name}: not a rotation (|R^T R - I| = {defect:.2g}, det = {np.linalg.det(rotation):.3g}); "
-            "scale and reflection do not belong in a rigid transform"
-        )
+    checked: Float64 = as_transforms(array[None], name)[0]
+    return checked
+
+
+def as_transforms(transforms: npt.ArrayLike, name: str = "T") -> Float64:
+    """Return rigid transforms (N, D + 1, D + 1) as :func:`as_transform` does each; errors name the row."""
+    array = np.array(transforms, dtype=np.float64)
+    d = array.shape[-1] - 1
+
+    def fail(bad: Any, what: str) -> None:
+        if np.any(bad):
+            where = name if len(array) == 1 else f"{name} {int(np.argmax(bad))}"
+            raise InvalidInputError(f"{where}: {what}")
+
+    fail(~np.isfinite(array).all(axis=(1, 2)), "has values that are not finite")
+    last = np.eye(d + 1)[-1]
+    fail((np.abs(array[:, -1] - last) > 1e-9).any(axis=1), "the last row must be (0, .., 0, 1)")
+    rotation = array[:, :d, :d]
+    defect = np.abs(np.swapaxes(rotation, 1, 2) @ rotation - np.eye(d)).max(axis=(1, 2), initial=0.0)
+    determinant = np.linalg.det(rotation)
+    bad = (defect > ROTATION_TOLERANCE) | (determinant < 0)
+    if bad.any():
+        k = int(np.argmax(bad))
+        size = f"|R^T R - I| = {defect[k]:.2g}, det = {determinant[k]:.3g}"
+        fail(bad, f"not a rotation ({size}); scale and reflection do not belong in a rigid transform")
     u, _, vt = np.linalg.svd(rotation)
-    array[:dimension, :dimension] = u @ vt
+    array[:, :d, :d] = u @ vt
     return array

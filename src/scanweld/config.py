@@ -7,7 +7,7 @@ import difflib
 import json
 import math
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar, get_type_hints
 
@@ -21,7 +21,7 @@ def setting(default: Any, doc: str, *, low: float | None = None, high: float | N
     return dataclasses.field(default=default, metadata={"doc": doc, "low": low, "high": high})
 
 
-def section(factory: type[Any], doc: str) -> Any:
+def section(factory: Callable[[], Any], doc: str) -> Any:
     """Declare a nested configuration."""
     return dataclasses.field(default_factory=factory, metadata={"doc": doc})
 

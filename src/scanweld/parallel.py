@@ -16,6 +16,7 @@ import os
 import tempfile
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -51,9 +52,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # spinning OpenMP workers o
 import numba  # noqa: E402  (the two variables above must be set before it loads)
 
 # error_model "numpy": a division by zero gives inf, not a branch. Kernels test masks, never NaN (fast-math).
-kernel: Callable[[Any], Any] = numba.njit(
-    fastmath=True, error_model="numpy", boundscheck=False, cache=True, nogil=True
-)
+kernel: Callable[[Any], Any] = numba.njit(fastmath=True, error_model="numpy", boundscheck=False, cache=True, nogil=True)
 """Decorator of every compiled kernel."""
 
 inlined: Callable[[Any], Any] = numba.njit(
@@ -74,7 +73,9 @@ def kernels_are_cached(group: str, *, now: bool = False) -> bool:
     return note.exists()
 
 
-_num_threads = max(1, min(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1, 16))
+_num_threads = max(
+    1, min(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1, 16)
+)
 _pool: ThreadPoolExecutor | None = None
 
 
@@ -98,7 +99,7 @@ def split_range(count: int, parts: int) -> list[tuple[int, int]]:
     """Split range(count) into at most `parts` contiguous, nearly equal, non-empty ranges."""
     parts = max(1, min(parts, count))
     bounds = [count * i // parts for i in range(parts + 1)]
-    return list(zip(bounds[:-1], bounds[1:], strict=True))
+    return list(pairwise(bounds))
 
 
 def run_ranges(count: int, body: Callable[[int, int], object]) -> None:

@@ -9,7 +9,7 @@ from enum import Enum
 import numpy as np
 import numpy.typing as npt
 
-from scanweld.arrays import Float64, as_transform
+from scanweld.arrays import Float64, as_transforms
 from scanweld.errors import InvalidInputError
 
 
@@ -44,8 +44,7 @@ class Trajectory:
             raise InvalidInputError(
                 f"trajectory: timestamps must increase strictly, row {at} has {times[at]:.6f} after {times[at - 1]:.6f}"
             )
-        for index in range(len(poses)):
-            poses[index] = as_transform(poses[index], f"trajectory: pose {index}")
+        poses = as_transforms(poses, "trajectory: pose")
         times.flags.writeable = poses.flags.writeable = False
         object.__setattr__(self, "timestamps_s", times)
         object.__setattr__(self, "T_world_camera", poses)

@@ -23,7 +23,9 @@ class SurfaceConfig:
     noise_floor_m: float = setting(0.0012, "depth noise at noise_nearest_m [m]; raise for a worse sensor", low=1e-6)
     noise_growth: float = setting(0.0019, "growth of the noise with the square of the depth [1/m]", low=0.0)
     noise_nearest_m: float = setting(0.4, "depth of the least noise [m]", low=0.0)
-    normal_radius: int = setting(2, "window radius of the normals [pixels]; raise for noise, lower for detail", low=1, high=8)
+    normal_radius: int = setting(
+        2, "window radius of the normals [pixels]; raise for noise, lower for detail", low=1, high=8
+    )
     min_cosine: float = setting(0.15, "surfaces seen more flatly than this cosine have no normal", low=0.01, high=1.0)
     levels: int = setting(3, "pyramid levels; raise for fast motion", low=1, high=6)
     bilateral: bool = setting(False, "smooth the depth before taking normals; slower")
@@ -117,7 +119,12 @@ def half_size(depth_m: Float32, camera: PinholeCamera, relative_band: float = 0.
     band = np.float32(relative_band)
     run_ranges(half.shape[0], lambda start, stop: kernels.halve_depth(start, stop, depth, band, half))
     smaller = PinholeCamera(
-        camera.fx / 2, camera.fy / 2, (camera.cx + 0.5) / 2 - 0.5, (camera.cy + 0.5) / 2 - 0.5, half.shape[1], half.shape[0]
+        camera.fx / 2,
+        camera.fy / 2,
+        (camera.cx + 0.5) / 2 - 0.5,
+        (camera.cy + 0.5) / 2 - 0.5,
+        half.shape[1],
+        half.shape[0],
     )
     return half, smaller
 

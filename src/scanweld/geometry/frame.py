@@ -33,9 +33,7 @@ class Frame:
             raise InvalidInputError(f"frame: depth_m must be float32 [m], got {self.depth_m.dtype}")
         if self.depth_m.shape != self.camera.shape:
             raise InvalidInputError(f"frame: depth has shape {self.depth_m.shape}, the camera {self.camera.shape}")
-        if self.color is not None and (
-            self.color.shape != (*self.camera.shape, 3) or self.color.dtype != np.uint8
-        ):
+        if self.color is not None and (self.color.shape != (*self.camera.shape, 3) or self.color.dtype != np.uint8):
             raise InvalidInputError(
                 f"frame: color must be (H, W, 3) uint8 of the size of the depth {self.camera.shape}, "
                 f"got {self.color.shape} {self.color.dtype}"

@@ -19,9 +19,7 @@ def halve_depth(start, stop, depth, relative_band, out):
             a, b = depth[2 * v, 2 * u], depth[2 * v, 2 * u + 1]
             c, d = depth[2 * v + 1, 2 * u], depth[2 * v + 1, 2 * u + 1]
             far = np.float32(1e9)
-            nearest = min(
-                min(a if a > 0 else far, b if b > 0 else far), min(c if c > 0 else far, d if d > 0 else far)
-            )
+            nearest = min(min(a if a > 0 else far, b if b > 0 else far), min(c if c > 0 else far, d if d > 0 else far))
             limit = nearest * (np.float32(1) + relative_band)
             total, count = np.float32(0), np.float32(0)
             for z in (a, b, c, d):
@@ -83,11 +81,11 @@ def surface_rows(start, stop, depth, intrinsics, radius, noise, min_cosine, out)
             for du in range(-radius, radius + 1):
                 if dv == 0 and du <= 0:
                     continue
+                i, j = radius, width - radius
                 add_slopes(
-                    before[radius - du : width - radius - du], centre[radius : width - radius],
-                    behind[radius + du : width - radius + du], bend[radius : width - radius],
-                    np.float32(du), np.float32(dv), sums[0, radius : width - radius], sums[1, radius : width - radius],
-                    sums[2, radius : width - radius], sums[3, radius : width - radius], sums[4, radius : width - radius],
+                    before[i - du : j - du], centre[i:j], behind[i + du : j + du], bend[i:j],
+                    np.float32(du), np.float32(dv),
+                    sums[0, i:j], sums[1, i:j], sums[2, i:j], sums[3, i:j], sums[4, i:j],
                 )  # fmt: skip
         for u in range(width):
             sxx, sxy, syy, sx, sy = sums[0, u], sums[1, u], sums[2, u], sums[3, u], sums[4, u]

@@ -141,9 +141,21 @@ def from_quaternion_xyzw(quaternion_xyzw: npt.ArrayLike, translation_m: npt.Arra
     q = q / np.linalg.norm(q, axis=-1, keepdims=True)
     x, y, z, w = np.moveaxis(q, -1, 0)
     T = np.zeros((*q.shape[:-1], 4, 4))
-    T[..., 0, 0], T[..., 0, 1], T[..., 0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)
-    T[..., 1, 0], T[..., 1, 1], T[..., 1, 2] = 2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)
-    T[..., 2, 0], T[..., 2, 1], T[..., 2, 2] = 2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)
+    T[..., 0, 0], T[..., 0, 1], T[..., 0, 2] = (
+        1 - 2 * (y * y + z * z),
+        2 * (x * y - z * w),
+        2 * (x * z + y * w),
+    )
+    T[..., 1, 0], T[..., 1, 1], T[..., 1, 2] = (
+        2 * (x * y + z * w),
+        1 - 2 * (x * x + z * z),
+        2 * (y * z - x * w),
+    )
+    T[..., 2, 0], T[..., 2, 1], T[..., 2, 2] = (
+        2 * (x * z - y * w),
+        2 * (y * z + x * w),
+        1 - 2 * (x * x + y * y),
+    )
     T[..., :3, 3] = translation_m
     T[..., 3, 3] = 1
     return T
@@ -154,15 +166,17 @@ def quaternion_xyzw_from_rotation(rotation: npt.ArrayLike) -> Float64:
     R = np.asarray(rotation, dtype=np.float64)
     m00, m11, m22 = R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]
     # Row k is 4 q_k q: all four are the same quaternion, the one with the largest q_k is well conditioned.
+    sum_01, sum_02, sum_12 = (R[..., i, j] + R[..., j, i] for i, j in ((0, 1), (0, 2), (1, 2)))
+    x, y, z = R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]
     rows = np.stack(
         [
-            np.stack([1 + m00 - m11 - m22, R[..., 0, 1] + R[..., 1, 0], R[..., 0, 2] + R[..., 2, 0], R[..., 2, 1] - R[..., 1, 2]], -1),
-            np.stack([R[..., 0, 1] + R[..., 1, 0], 1 - m00 + m11 - m22, R[..., 1, 2] + R[..., 2, 1], R[..., 0, 2] - R[..., 2, 0]], -1),
-            np.stack([R[..., 0, 2] + R[..., 2, 0], R[..., 1, 2] + R[..., 2, 1], 1 - m00 - m11 + m22, R[..., 1, 0] - R[..., 0, 1]], -1),
-            np.stack([R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1], 1 + m00 + m11 + m22], -1),
+            np.stack([1 + m00 - m11 - m22, sum_01, sum_02, x], axis=-1),
+            np.stack([sum_01, 1 - m00 + m11 - m22, sum_12, y], axis=-1),
+            np.stack([sum_02, sum_12, 1 - m00 - m11 + m22, z], axis=-1),
+            np.stack([x, y, z, 1 + m00 + m11 + m22], axis=-1),
         ],
         axis=-2,
-    )  # fmt: skip
+    )
     largest = np.argmax(np.diagonal(rows, axis1=-2, axis2=-1), axis=-1)
     q = np.take_along_axis(rows, largest[..., None, None], axis=-2)[..., 0, :]
     q = q / np.linalg.norm(q, axis=-1, keepdims=True)

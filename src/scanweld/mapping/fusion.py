@@ -21,13 +21,25 @@ from scanweld.parallel import run_ranges
 class FusionConfig:
     """When a measurement and a surfel are the same, and which surfels stay."""
 
-    gate_sigma: float = setting(3.0, "a measurement merges within this many standard deviations of the depth noise; raise for noise", low=0.1)
-    gate_floor_m: float = setting(0.005, "and always within this [m]; raise for a wrong camera model, lower for fine detail", low=0.0)
+    gate_sigma: float = setting(
+        3.0,
+        "a measurement merges within this many standard deviations of the depth noise; raise for noise",
+        low=0.1,
+    )
+    gate_floor_m: float = setting(
+        0.005, "and always within this [m]; raise for a wrong camera model, lower for fine detail", low=0.0
+    )
     min_cosine: float = setting(0.5, "merged normals agree at least this well; lower for noise", low=-1.0, high=1.0)
     stable_confidence: float = setting(5.0, "a surfel of this confidence is stable; raise for clutter", low=0.0)
-    unstable_frames: int = setting(40, "a surfel still unstable after this many frames is removed; raise to keep what is seen briefly", low=1)
+    unstable_frames: int = setting(
+        40,
+        "a surfel still unstable after this many frames is removed; raise to keep what is seen briefly",
+        low=1,
+    )
     max_confidence: float = setting(100.0, "confidence stops growing here; lower for maps that follow change", low=1.0)
-    free_space_margin_m: float = setting(0.05, "a surfel this far in front of what is seen through it loses confidence [m]", low=0.0)
+    free_space_margin_m: float = setting(
+        0.05, "a surfel this far in front of what is seen through it loses confidence [m]", low=0.0
+    )
     clean_interval: int = setting(8, "frames between removals; lower saves memory, costs time", low=1)
 
     def __post_init__(self) -> None:
@@ -70,7 +82,7 @@ def fuse(
     color = pyramid.frame.color
     if color is None:
         color = np.full((*camera.shape, 3), 160, np.uint8)
-    alpha = radial_weight(camera)
+    alpha, most = radial_weight(camera), np.float32(config.max_confidence)
     transform = T_world_camera[:3].astype(np.float32)
     parameters = np.array(
         [config.gate_sigma, config.gate_floor_m, config.min_cosine, config.free_space_margin_m], np.float32
@@ -86,7 +98,7 @@ def fuse(
 
     def merge(start: int, stop: int) -> None:
         kernels.merge_rows(
-            start, stop, action, index_map, surface, color, alpha, transform, np.float32(config.max_confidence), frame_id,
+            start, stop, action, index_map, surface, color, alpha, transform, most, frame_id,
             a.positions, a.normals, a.colors, a.radii, a.confidences, a.last_seen,
         )  # fmt: skip
 

@@ -35,7 +35,9 @@ def cull(start, stop, positions, count, transform, intrinsics, width, height, ma
             yc = transform[1, 0] * x + transform[1, 1] * y + transform[1, 2] * z + transform[1, 3]
             zc = transform[2, 0] * x + transform[2, 1] * y + transform[2, 2] * z + transform[2, 3]
             seen = (zc > np.float32(0.01)) & (zc < far)
-            seen = seen & (fx * xc > left * zc) & (fx * xc < right * zc) & (fy * yc > top * zc) & (fy * yc < bottom * zc)
+            seen = (
+                seen & (fx * xc > left * zc) & (fx * xc < right * zc) & (fy * yc > top * zc) & (fy * yc < bottom * zc)
+            )
             ids[kept] = i
             kept += 1 if seen else 0
         counts[chunk] = kept - first
@@ -90,7 +92,18 @@ def resolve(start, stop, buffers, index_map, row_counts):
 
 
 @kernel
-def gather_view(start, stop, index_map, offsets, positions, normals, confidences, out_positions, out_normals, out_confidences):
+def gather_view(
+    start,
+    stop,
+    index_map,
+    offsets,
+    positions,
+    normals,
+    confidences,
+    out_positions,
+    out_normals,
+    out_confidences,
+):
     """Copy the surfels of index-map rows start..stop, row-major, to the columns that `offsets` (H,) gives out."""
     for v in range(start, stop):
         k = offsets[v]
@@ -210,8 +223,8 @@ def merge_rows(
             length = one / np.sqrt(m0 * m0 + m1 * m1 + m2 * m2)
             for axis in range(3):
                 normals[axis, i] *= length
-            # The finest view of a surface sets how large its surfels are.
-            radii[i] = min(radii[i], s[7])
+            # The finest view of a surface sets how large its surfels are; neighbours may be two of its pixels apart.
+            radii[i] = min(radii[i], np.float32(2) * s[7])
             confidences[i] = min(weight + more, most)
             last_seen[i] = frame_id
 
@@ -230,7 +243,10 @@ def append_rows(
             s = surface[v, u]
             for axis in range(3):
                 positions[axis, k] = (
-                    transform[axis, 0] * s[0] + transform[axis, 1] * s[1] + transform[axis, 2] * s[2] + transform[axis, 3]
+                    transform[axis, 0] * s[0]
+                    + transform[axis, 1] * s[1]
+                    + transform[axis, 2] * s[2]
+                    + transform[axis, 3]
                 )
                 normals[axis, k] = transform[axis, 0] * s[3] + transform[axis, 1] * s[4] + transform[axis, 2] * s[5]
                 colors[axis, k] = np.float32(color[v, u, axis])
@@ -242,7 +258,21 @@ def append_rows(
 
 
 @kernel
-def splat_discs(start, stop, positions, normals, colors, radii, order, transform, intrinsics, rows_per_part, depth, rgb, shade):
+def splat_discs(
+    start,
+    stop,
+    positions,
+    normals,
+    colors,
+    radii,
+    order,
+    transform,
+    intrinsics,
+    rows_per_part,
+    depth,
+    rgb,
+    shade,
+):
     """Draw surfels as discs into image parts start..stop of `rows_per_part` rows each; for pictures.
 
     order (N,) int32: surfels to draw. depth (H, W) float32 starts at inf; rgb, shade (H, W, 3) float32: colour and

@@ -28,7 +28,12 @@ class Candidates:
 
 
 def find_candidates(
-    surfels: SurfelMap, T_world_camera: Float64, camera: PinholeCamera, *, margin_pixels: float = 64.0, far_m: float = 1e6
+    surfels: SurfelMap,
+    T_world_camera: Float64,
+    camera: PinholeCamera,
+    *,
+    margin_pixels: float = 64.0,
+    far_m: float = 1e6,
 ) -> Candidates:
     """List the surfels that project into the image or within a margin of it."""
     count = len(surfels)
@@ -40,7 +45,18 @@ def find_candidates(
 
     def body(start: int, stop: int) -> None:
         kernels.cull(
-            start, stop, positions, count, transform, intrinsics, camera.width, camera.height, margin, far, ids, counts
+            start,
+            stop,
+            positions,
+            count,
+            transform,
+            intrinsics,
+            camera.width,
+            camera.height,
+            margin,
+            far,
+            ids,
+            counts,
         )
 
     run_ranges(chunks, body)
@@ -48,7 +64,11 @@ def find_candidates(
 
 
 def render_index_map(
-    surfels: SurfelMap, candidates: Candidates, T_world_camera: Float64, camera: PinholeCamera, min_cosine: float = 0.1
+    surfels: SurfelMap,
+    candidates: Candidates,
+    T_world_camera: Float64,
+    camera: PinholeCamera,
+    min_cosine: float = 0.1,
 ) -> tuple[Int32, Int64]:
     """Splat each candidate into one pixel, the nearest wins.
 
@@ -111,7 +131,7 @@ class Picture:
         in_camera = self.normals @ T_world_camera[:3, :3].astype(np.float32)
         colors = np.clip(np.rint((in_camera * np.array([1, -1, -1], np.float32) + 1) * 127.5), 0, 255)
         colors[~seen] = background
-        return colors.astype(np.uint8)
+        return np.asarray(colors, dtype=np.uint8)
 
 
 def render_picture(

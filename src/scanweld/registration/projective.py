@@ -6,8 +6,8 @@ solved by Gauss-Newton with Huber weights on residuals in units of the depth noi
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -27,15 +27,36 @@ class ProjectiveConfig:
     """Schedule and gates of the projective aligner."""
 
     iterations: int = setting(10, "most iterations on each pyramid level; raise for fast motion", low=1, high=1000)
-    coarse_gate_m: float = setting(0.25, "largest distance of a match on the coarsest level [m]; raise for fast motion, lower for clutter", low=1e-3)
-    fine_gate_m: float = setting(0.05, "largest distance of a match on the finest level [m]; lower for clutter, raise for noise", low=1e-3)
+    coarse_gate_m: float = setting(
+        0.25,
+        "largest distance of a match on the coarsest level [m]; raise for fast motion, lower for clutter",
+        low=1e-3,
+    )
+    widest_gate_m: float = setting(
+        1.0, "coarse gates up to this are tried when an alignment fails [m]; raise for fast motion", low=1e-3
+    )
+    fine_gate_m: float = setting(
+        0.05,
+        "largest distance of a match on the finest level [m]; lower for clutter, raise for noise",
+        low=1e-3,
+    )
     min_cosine: float = setting(0.7, "matched normals agree at least this well; lower for noise", low=-1.0, high=1.0)
-    robust_sigma: float = setting(2.0, "Huber threshold in standard deviations of the depth noise; lower for outliers", low=0.1)
-    max_points: int = setting(80_000, "source points on the finest level; a quarter on each coarser; raise for accuracy, costs time", low=100)
+    robust_sigma: float = setting(
+        2.0, "Huber threshold in standard deviations of the depth noise; lower for outliers", low=0.1
+    )
+    max_points: int = setting(
+        80_000,
+        "source points on the finest level; a quarter on each coarser; raise for accuracy, costs time",
+        low=100,
+    )
     min_points: int = setting(200, "fewer matches than this give no answer", low=12)
     min_overlap: float = setting(0.05, "smaller shares of matched points give no answer", low=0.0, high=1.0)
-    min_agreement: float = setting(0.5, "share of the compared points that agree with the depth in a trusted answer", low=0.0, high=1.0)
-    max_conflict: float = setting(0.3, "share of the compared points in front of the depth in a trusted answer", low=0.0, high=1.0)
+    min_agreement: float = setting(
+        0.5, "share of the compared points that agree with the depth in a trusted answer", low=0.0, high=1.0
+    )
+    max_conflict: float = setting(
+        0.3, "share of the compared points in front of the depth in a trusted answer", low=0.0, high=1.0
+    )
     step_m: float = setting(1e-4, "converged when a step moves the points less than this [m]", low=0.0)
 
     def __post_init__(self) -> None:
@@ -86,7 +107,19 @@ def projective_step(
 
     def body(start: int, stop: int) -> None:
         kernels.point_to_plane_sums(
-            start, stop, positions_m, normals, transform, surface, intrinsics, width, height, gate, cosine, robust, partials
+            start,
+            stop,
+            positions_m,
+            normals,
+            transform,
+            surface,
+            intrinsics,
+            width,
+            height,
+            gate,
+            cosine,
+            robust,
+            partials,
         )
 
     run_ranges(chunks, body)
@@ -139,7 +172,9 @@ def align_projective(
     for level in range(coarsest, -1, -1):
         stride = max(1, -(-positions_m.shape[1] // max(config.min_points, config.max_points >> (2 * level))))
         source, directions = positions_m[:, ::stride].copy(), normals[:, ::stride].copy()
-        centroid, radius = _centroid_and_radius(se3.transform_points(T, source[:, :: max(1, source.shape[1] // 1000)].T))
+        centroid, radius = _centroid_and_radius(
+            se3.transform_points(T, source[:, :: max(1, source.shape[1] // 1000)].T)
+        )
         gate = config.fine_gate_m * (config.coarse_gate_m / config.fine_gate_m) ** (level / max(coarsest, 1))
         converged = False
         for _ in range(config.iterations):
@@ -173,6 +208,21 @@ def align_projective(
         note=note,
         history=tuple(history) if keep_history else (),
     )
+
+
+def schedules(config: ProjectiveConfig) -> Iterator[ProjectiveConfig]:
+    """Yield the configured schedule, then wider and more tolerant ones for when it fails.
+
+    Which coarse gate has the largest basin depends on the scene: one that is wide enough for the motion takes in wrong
+    neighbours. The free-space check tells a right answer from a wrong one, so trying several is safe.
+    """
+    yield config
+    gate = config.coarse_gate_m * 2
+    while gate <= config.widest_gate_m:
+        yield replace(config, coarse_gate_m=gate, min_cosine=min(config.min_cosine, 0.0))
+        if gate * 2 > config.widest_gate_m:
+            yield replace(config, coarse_gate_m=gate)
+        gate *= 2
 
 
 def _centroid_and_radius(points_m: Float64) -> tuple[Float64, float]:

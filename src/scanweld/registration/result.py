@@ -24,11 +24,15 @@ class Status(Enum):
         return self is Status.CONVERGED
 
     @property
+    def has_pose(self) -> bool:
+        """Whether the transform fits the data, be it unfinished or free in some directions."""
+        return self in (Status.CONVERGED, Status.MAX_ITERATIONS, Status.DEGENERATE)
+
+    @property
     def rank(self) -> int:
         """Higher is more of an answer; for choosing among attempts."""
-        return (
-            Status.TOO_FEW_CORRESPONDENCES, Status.NO_OVERLAP, Status.DEGENERATE, Status.MAX_ITERATIONS, Status.CONVERGED
-        ).index(self)  # fmt: skip
+        order = ("TOO_FEW_CORRESPONDENCES", "NO_OVERLAP", "DEGENERATE", "MAX_ITERATIONS", "CONVERGED")
+        return order.index(self.name)
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,8 +64,8 @@ class RegistrationResult:
     rmse_m : root mean square residual of the inliers, in the metric that was minimised [m]
     loss : mean robust loss of the correspondences at the last step, residuals in units of their noise (where the
         aligner has a noise model, else 0)
-    information : (6, 6) in 3-D, (3, 3) in 2-D; the Gauss-Newton Hessian of the metric that was minimised [1/m^2,
-        1/(m rad), 1/rad^2 times the weight's unit], translation first, left perturbation at the target's origin
+    information : (6, 6) in 3-D, (3, 3) in 2-D; Gauss-Newton Hessian of the metric that was minimised, translation [m]
+        first, rotation [rad] second, left perturbation at the target's origin
     unobservable : directions that the data leaves free; they stay at the initial guess
     note : one sentence for a person where the status is not CONVERGED, else ""
     history : the steps, where asked for

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 
@@ -55,7 +56,7 @@ def trajectory_of(results: Sequence[FrameResult], *, tracked_only: bool = False)
     times = np.array([result.timestamp_s for result in results], np.float64)
     poses = np.array([result.T_world_camera for result in results], np.float64).reshape(-1, 4, 4)
     measured = np.array([k for k, result in enumerate(results) if result.state in POSED], np.int64)
-    for before, after in zip(measured[:-1], measured[1:], strict=True):
+    for before, after in pairwise(measured):
         if after - before > 1:
             inner = slice(before + 1, after)
             fraction = (times[inner] - times[before]) / (times[after] - times[before])

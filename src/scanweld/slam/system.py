@@ -19,7 +19,7 @@ from scanweld.geometry.views import MapCorrection, ModelView
 from scanweld.loop_closure.loop_closer import NoLoopCloser
 from scanweld.mapping.fusion import FusionConfig
 from scanweld.mapping.mapper import SurfelMapper
-from scanweld.registration.result import RegistrationResult, Status
+from scanweld.registration.result import RegistrationResult
 from scanweld.slam.motion import ConstantVelocity, trajectory_of
 from scanweld.tracking.tracker import FrameToModelTracker, TrackingConfig
 from scanweld.trajectory import FrameResult, FrameState, Trajectory
@@ -160,7 +160,9 @@ class Slam:
         share = seen / pyramid.levels[0].depth_m.size
         start = self._placed(pyramid.frame, self._T_world_first)
         if share < MIN_FIRST_SHARE:
-            return replace(start, state=FrameState.LOST, note=f"no map yet, and only {share:.1%} of the depth is usable")
+            return replace(
+                start, state=FrameState.LOST, note=f"no map yet, and only {share:.1%} of the depth is usable"
+            )
         return start
 
     def _placed(self, frame: Frame, T_world_camera: Float64) -> FrameResult:
@@ -173,7 +175,7 @@ class Slam:
 
     def _judged(self, frame: Frame, predicted: Float64, aligned: RegistrationResult) -> FrameResult:
         """Turn an alignment into a state: no answer means LOST, and the motion model's pose."""
-        lost = aligned.status in (Status.TOO_FEW_CORRESPONDENCES, Status.NO_OVERLAP)
+        lost = not aligned.status.has_pose
         was_lost = bool(self.results) and self.results[-1].state is FrameState.LOST
         state = FrameState.LOST if lost else FrameState.RELOCALISED if was_lost else FrameState.TRACKING
         return FrameResult(

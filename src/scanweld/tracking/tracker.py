@@ -11,7 +11,7 @@ from scanweld.config import check_ranges, section, setting
 from scanweld.geometry import se3
 from scanweld.geometry.depth import SurfacePyramid
 from scanweld.geometry.views import ModelView
-from scanweld.registration.projective import ProjectiveConfig, align_projective
+from scanweld.registration.projective import ProjectiveConfig, align_projective, schedules
 from scanweld.registration.result import RegistrationResult
 
 
@@ -19,7 +19,12 @@ from scanweld.registration.result import RegistrationResult
 class TrackingConfig:
     """How a frame is aligned with the map."""
 
-    stable_fraction: float = setting(1.0, "track against this share of the visible surfels, the most stable ones; lower it against drift and for speed", low=0.001, high=1.0)
+    stable_fraction: float = setting(
+        1.0,
+        "track against this share of the visible surfels, the most stable ones; lower it against drift and for speed",
+        low=0.001,
+        high=1.0,
+    )
     projective: ProjectiveConfig = section(ProjectiveConfig, "schedule and gates of the alignment")
 
     def __post_init__(self) -> None:
@@ -46,15 +51,21 @@ class FrameToModelTracker:
         The result of moving the camera: T_target_source is T_world_camera.
         """
         positions, normals = self._select(view)
-        result = align_projective(
-            positions, normals, pyramid.levels, se3.inverse(T_world_camera), self.config.projective
-        )
+        T_camera_world = se3.inverse(T_world_camera)
+        best: RegistrationResult | None = None
+        for schedule in schedules(self.config.projective):
+            result = align_projective(positions, normals, pyramid.levels, T_camera_world, schedule)
+            if best is None or result.status.rank > best.status.rank:
+                best = result
+            if best.status.has_pose:
+                break
+        assert best is not None  # there is at least one schedule
         # The aligner moves the map to the camera: T_cw <- exp(xi) T_cw. With T_wc <- exp(eta) T_wc, xi = -Ad(T_cw) eta.
-        adjoint = se3.adjoint(result.T_target_source)
+        adjoint = se3.adjoint(best.T_target_source)
         return replace(
-            result,
-            T_target_source=se3.inverse(result.T_target_source),
-            information=adjoint.T @ result.information @ adjoint,
+            best,
+            T_target_source=se3.inverse(best.T_target_source),
+            information=adjoint.T @ best.information @ adjoint,
         )
 
     def _select(self, view: ModelView) -> tuple[Float32, Float32]:

@@ -8,11 +8,11 @@ import numpy as np
 import numpy.typing as npt
 
 from scanweld.arrays import Float32, as_transform
-from scanweld.config import check_ranges, section, setting
+from scanweld.config import check_ranges, section
 from scanweld.geometry import se3
 from scanweld.geometry.depth import SurfaceConfig, SurfacePyramid, build_pyramid
 from scanweld.geometry.frame import Frame
-from scanweld.registration.projective import ProjectiveConfig, align_projective
+from scanweld.registration.projective import ProjectiveConfig, align_projective, schedules
 from scanweld.registration.result import RegistrationResult, Status
 from scanweld.registration.verification import check_against_depth
 
@@ -23,9 +23,9 @@ class TwoFrameConfig:
 
     surfaces: SurfaceConfig = section(SurfaceConfig, "how depth becomes surfaces")
     projective: ProjectiveConfig = section(
-        lambda: ProjectiveConfig(iterations=40, min_cosine=0.8, step_m=2e-5), "schedule and gates of the alignment"
+        lambda: ProjectiveConfig(iterations=40, min_cosine=0.8, step_m=2e-5),
+        "schedule and gates of the alignment",
     )
-    widest_gate_m: float = setting(1.0, "coarse gates up to this are tried when the first alignment fails [m]", low=1e-3)
 
     def __post_init__(self) -> None:
         check_ranges(self)
@@ -50,7 +50,7 @@ def align_frames(
     source, target = build_pyramid(a, config.surfaces), build_pyramid(b, config.surfaces)
     positions, normals = surface_points(source)
     best: RegistrationResult | None = None
-    for projective in _schedules(config):
+    for projective in schedules(config.projective):
         result = align_projective(positions, normals, target.levels, start, projective)
         result = _check_backwards(result, source, target, projective)
         if result.status is Status.CONVERGED:
@@ -61,22 +61,11 @@ def align_frames(
     return best
 
 
-def _schedules(config: TwoFrameConfig) -> list[ProjectiveConfig]:
-    """The configured gates first, then wider and more tolerant ones."""
-    first = config.projective
-    tries = [first]
-    gate = first.coarse_gate_m
-    while gate * 2 <= config.widest_gate_m:
-        gate *= 2
-        tries.append(replace(first, coarse_gate_m=gate, min_cosine=min(first.min_cosine, 0.0)))
-    return [*tries, replace(first, coarse_gate_m=gate)] if len(tries) > 1 else tries
-
-
 def _check_backwards(
     result: RegistrationResult, source: SurfacePyramid, target: SurfacePyramid, config: ProjectiveConfig
 ) -> RegistrationResult:
     """The points of b must not stand in free space of a either."""
-    if result.status not in (Status.CONVERGED, Status.DEGENERATE, Status.MAX_ITERATIONS):
+    if not result.status.has_pose:
         return result
     positions, normals = surface_points(target)
     agreement = check_against_depth(positions, normals, se3.inverse(result.T_target_source), source.levels[0])

@@ -30,9 +30,7 @@ def cast_rays(scene: Scene, origin_m: Float64, directions: Float64) -> tuple[Flo
     tapers = np.ascontiguousarray(scene.scalars[:, 4])
 
     def body(start: int, stop: int) -> None:
-        kernels.cast(
-            origin, rays, start, stop, scene.bounds, scene.links, shapes, tapers, scene.affine, distance, hit
-        )
+        kernels.cast(origin, rays, start, stop, scene.bounds, scene.links, shapes, tapers, scene.affine, distance, hit)
 
     run_ranges(count, body)
     return distance, hit

@@ -135,9 +135,7 @@ def _study(root: Placement, rng: np.random.Generator) -> None:
     f.potted_plant(s.middle.at(1.6, 1.55), 1.3, rng, spread=0.4)
     f.cupboard(s.left.at(-1.4, 0), 0.9, 1.1, 0.4, f.WALNUT, doors=2)
     f.vase(s.left.at(-1.4, 0.2, height=1.1), "#e0a33e")
-    f.framed_picture(
-        s.front.at(-1.3, 0), 0.6, 0.8, 1.55, "#f0d9b5", "#3b3a3c", seed=64, texture=Texture.PRINT
-    )
+    f.framed_picture(s.front.at(-1.3, 0), 0.6, 0.8, 1.55, "#f0d9b5", "#3b3a3c", seed=64, texture=Texture.PRINT)
     room_lights(s.middle)
 
 
@@ -161,9 +159,7 @@ def _kitchen(root: Placement, rng: np.random.Generator) -> None:
     s.front.span((-1.14, 0.62, 0.62), (-0.46, 0.64, 0.626), f.DARK_METAL)
     s.front.rod((-0.52, 0.75, 0.66), (-0.52, 1.2, 0.66), 0.012, f.DARK_METAL)
     for k, (x, height) in enumerate(((-1.0, 1.5), (-0.75, 1.35), (-0.92, 1.2))):
-        s.front.box(
-            (x, height, 0.622), (0.12, 0.15, 0.003), Material(Texture.PRINT, "#f3efe6", "#c8553d"), seed=k
-        )
+        s.front.box((x, height, 0.622), (0.12, 0.15, 0.003), Material(Texture.PRINT, "#f3efe6", "#c8553d"), seed=k)
     on_top = s.right.at(0, 0.3, height=0.92)
     f.fruit_bowl(on_top.at(-1.2, 0))
     on_top.rod((0.1, 0, 0), (0.1, 0.18, 0), 0.09, f.plain("#b5413a"), end_radius=0.1)
@@ -199,9 +195,7 @@ def _bedroom(root: Placement, rng: np.random.Generator) -> None:
     bed.span((-0.71, 0.34, 0.55), (0.71, 0.585, 1.37), Material(Texture.STRIPES, "#3d6b8e", "#d8c4a0", 1.4))
     for k, x in enumerate((-0.36, 0.36)):
         bed.ball((x, 0.63, 0.3), (0.3, 0.09, 0.18), f.fabric("#f3efe6"), seed=k)
-        bed.ball(
-            (x, 0.68, 0.42), (0.2, 0.08, 0.13), f.fabric(("#b56576", "#e0a33e")[k]), axis=(0, 1, 0.5), seed=k
-        )
+        bed.ball((x, 0.68, 0.42), (0.2, 0.08, 0.13), f.fabric(("#b56576", "#e0a33e")[k]), axis=(0, 1, 0.5), seed=k)
     f.window(s.front.at(-0.1, 0), 1.3, 1.15, 0.95, "#5b7553", CEILING)
     f.radiator(s.front.at(-0.1, 0), 1.0)
     f.cupboard(s.left.at(0.95, 0), 1.1, 2.0, 0.5, f.PINE, doors=2)
@@ -236,9 +230,7 @@ def _hallway(root: Placement, rng: np.random.Generator) -> None:
             ("#cfe0dc", "#5b7553"),
             ("#efe6cf", "#704214"),
         )[k]
-        f.framed_picture(
-            s.back.at(x, 0), 0.42, 0.55, 1.62, first, second, seed=92 + k, frame=(f.OAK, f.WALNUT)[k % 2]
-        )
+        f.framed_picture(s.back.at(x, 0), 0.42, 0.55, 1.62, first, second, seed=92 + k, frame=(f.OAK, f.WALNUT)[k % 2])
     s.back.box((1.6, 0.24, 0.18), (1.2, 0.06, 0.34), f.OAK)
     for x in (1.1, 2.1):
         s.back.box((x, 0.11, 0.18), (0.06, 0.22, 0.3), f.OAK)
@@ -297,9 +289,7 @@ def _gallery(root: Placement, rng: np.random.Generator) -> None:
         x = -2.5 + 1.2 * k
         first, second = f.BOOK_COLORS[(4 * k + 1) % 16], f.BOOK_COLORS[(4 * k + 10) % 16]
         kind = Texture.PRINT if k % 2 else Texture.PICTURE
-        f.framed_picture(
-            s.back.at(x, 0), 0.62, 0.8, 1.5, first, second, seed=120 + k, texture=kind, frame=f.DARK_METAL
-        )
+        f.framed_picture(s.back.at(x, 0), 0.62, 0.8, 1.5, first, second, seed=120 + k, texture=kind, frame=f.DARK_METAL)
     for k, color in enumerate(("#c8553d", "#e0a33e", "#2f6f73", "#385f8f", "#6a994e")):
         x = 2.4 - 0.42 * k
         s.front.span((x - 0.2, 0.05, 0), (x + 0.2, 1.75, 0.34), f.plain(color), seed=k)

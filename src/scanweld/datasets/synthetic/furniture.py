@@ -47,9 +47,7 @@ def fabric(color: str, *, shade: float = 0.72, scale: float = 1.0) -> Material:
     return Material(Texture.FABRIC, color, darker(color, shade), scale)
 
 
-def table(
-    p: Placement, width: float, depth: float, height: float, wood: Material = OAK, *, seed: int = 0
-) -> None:
+def table(p: Placement, width: float, depth: float, height: float, wood: Material = OAK, *, seed: int = 0) -> None:
     """Add a table: top, apron, four tapered legs and a shelf if it is low."""
     p.span((-width / 2, height - 0.035, -depth / 2), (width / 2, height, depth / 2), wood, seed=seed)
     x, z = width / 2 - 0.06, depth / 2 - 0.06
@@ -243,9 +241,7 @@ def framed_picture(
     p.sheet((0, centre, 0.012), width - 2 * inner, height - 2 * inner, art, seed=seed)
 
 
-def window(
-    p: Placement, width: float, height: float, sill: float, curtain: str | None, ceiling: float
-) -> None:
+def window(p: Placement, width: float, height: float, sill: float, curtain: str | None, ceiling: float) -> None:
     """Add a window with frame, sill, sky behind, and curtains with folds, on the wall at z = 0."""
     p.sheet(
         (0, sill + height / 2, 0.004),
@@ -269,9 +265,7 @@ def window(
         for k in range(7):
             x = side * (width / 2 - 0.06 + k * 0.075)
             fold = 0.05 + 0.014 * math.sin(2.2 * k)
-            p.rod(
-                (x, 0.05, 0.13), (x, rail - 0.01, 0.13), 0.047, fabric(curtain, scale=2), depth=fold, seed=k
-            )
+            p.rod((x, 0.05, 0.13), (x, rail - 0.01, 0.13), 0.047, fabric(curtain, scale=2), depth=fold, seed=k)
 
 
 def radiator(p: Placement, width: float) -> None:
@@ -305,9 +299,7 @@ def door_frame(p: Placement, width: float, height: float, paint: Material, *, de
     p.box((0, height + 0.05, depth / 2), (width + 0.22, 0.1, depth + 0.02), paint)
 
 
-def cupboard(
-    p: Placement, width: float, height: float, depth: float, wood: Material = OAK, *, doors: int = 3
-) -> None:
+def cupboard(p: Placement, width: float, height: float, depth: float, wood: Material = OAK, *, doors: int = 3) -> None:
     """Add a cupboard with doors and knobs, its back at z = 0."""
     p.span((-width / 2, 0.08, 0), (width / 2, height - 0.03, depth), wood)
     p.span((-width / 2 - 0.02, height - 0.03, 0), (width / 2 + 0.02, height, depth + 0.02), wood, seed=2)

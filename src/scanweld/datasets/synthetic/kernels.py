@@ -249,28 +249,16 @@ def _albedo(texture, u, v, x, y, z, su, sv, scale, seed, footprint):
         lozenge = abs(_wrap(u, 0.36) / 0.18 - 0.0) + abs(_wrap(v, 0.36) / 0.18)
         field = 1.0 if lozenge < 0.45 else (0.55 if lozenge < 0.75 else 0.0)
         mix = border if edge < 0.26 else field
-        gain = (
-            1.0
-            + 0.12 * _noise(120 * x, 9.0, 120 * z + s) * _fade(0.008, footprint)
-            + 0.1 * _noise(7 * x, s, 7 * z)
-        )
+        gain = 1.0 + 0.12 * _noise(120 * x, 9.0, 120 * z + s) * _fade(0.008, footprint) + 0.1 * _noise(7 * x, s, 7 * z)
     elif texture == 8:  # picture: hills, a sun, and brush strokes, different for each seed
         a, b = u / su, v / sv
-        h1 = (
-            0.25 * math.sin(2.1 * a + s)
-            + 0.12 * math.sin(5.3 * a + 2 * s)
-            + 0.6 * (_hash(int(seed), 1, 2) - 0.5)
-        )
+        h1 = 0.25 * math.sin(2.1 * a + s) + 0.12 * math.sin(5.3 * a + 2 * s) + 0.6 * (_hash(int(seed), 1, 2) - 0.5)
         h2 = h1 - 0.35 - 0.2 * math.sin(3.3 * a - s)
         sun = (a - 1.2 * _hash(int(seed), 5, 1) + 0.6) ** 2 * (su / sv) ** 2 + (b - 0.5) ** 2
         stroke = _noise(9 * a + s, 30 * b, s) * 0.12 + 0.1 * _noise(4 * a, 5 * b, s)
         mix = 0.95 if b < h2 else (0.62 if b < h1 else (0.0 if sun < 0.06 else 0.22 + 0.12 * b))
         mix += stroke
-        gain = (
-            0.75
-            + 0.5 * _noise(2.5 * a + s, 2.5 * b, 7.0 * s) * 0.5
-            + (0.35 if sun < 0.06 and b > h1 else 0.0)
-        )
+        gain = 0.75 + 0.5 * _noise(2.5 * a + s, 2.5 * b, 7.0 * s) * 0.5 + (0.35 if sun < 0.06 and b > h1 else 0.0)
     elif texture == 9:  # leaf: midrib and blotches
         rib = _line(abs(x), 0.004, footprint)
         mix = 0.5 * rib + 0.5 + 0.5 * _noise(20 * x + s, 20 * y, 20 * z)
@@ -397,9 +385,7 @@ def shade(origin, directions, start, stop, pixel_angle, distance, hit, integers,
         footprint = max(t * ray * pixel_angle / math.sqrt(slant), 1e-6)
         if integers[p, 1] == 2 and sv > su:  # the grain of wood follows the longer side
             u, v, su, sv = v, u, sv, su
-        mix, gain = _albedo(
-            integers[p, 1], u, v, mx, my, mz, su, sv, scalars[p, 3], float(integers[p, 2]), footprint
-        )
+        mix, gain = _albedo(integers[p, 1], u, v, mx, my, mz, su, sv, scalars[p, 3], float(integers[p, 2]), footprint)
         # Surfaces that look up get a little more of the ambient light than those that look down.
         sky = 0.8 - 0.2 * wy
         red, green, blue = ambient[0] * sky, ambient[1] * sky, ambient[2] * sky
@@ -421,9 +407,7 @@ def shade(origin, directions, start, stop, pixel_angle, distance, hit, integers,
                         off = 0.01 + gap * texel
                         vx, vy, vz = vx + off * wx, vy + off * wy, vz + off * wz
                         reach = math.sqrt(vx * vx + vy * vy + vz * vz)
-                        power = (power - 0.004) * _visibility(
-                            shadow, k, vx, vy, vz, reach, 0.02 + 0.6 * gap * texel
-                        )
+                        power = (power - 0.004) * _visibility(shadow, k, vx, vy, vz, reach, 0.02 + 0.6 * gap * texel)
                         red += lights[k, 3] * power
                         green += lights[k, 4] * power
                         blue += lights[k, 5] * power

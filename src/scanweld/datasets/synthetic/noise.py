@@ -90,9 +90,7 @@ EDGE_RATIO = 0.04
 """Neighbours whose depths differ by more than this share of the nearer one lie on different surfaces."""
 
 
-def degrade_depth(
-    depth_m: Float32, camera: PinholeCamera, model: NoiseModel, rng: np.random.Generator
-) -> Float32:
+def degrade_depth(depth_m: Float32, camera: PinholeCamera, model: NoiseModel, rng: np.random.Generator) -> Float32:
     """Return the depth image (H, W) [m] as `model` would have measured the exact `depth_m`; 0 is invalid.
 
     Order: shadow of the projector, edges, grazing surfaces and speckles lost; pixels shifted sideways; axial

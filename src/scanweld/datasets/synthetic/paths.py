@@ -86,9 +86,7 @@ def built_in_path(name: str, num_frames: int, fps: float) -> Trajectory:
     rounds = np.floor(travelled / length_m)
     at = np.interp(travelled - rounds * length_m, arc_m, phase)
     position, yaw, pitch = path.view(at)
-    return Trajectory(
-        frame_times_s(count, fps), _handheld(position, yaw, pitch, at, length_m / path.speed_mps)
-    )
+    return Trajectory(frame_times_s(count, fps), _handheld(position, yaw, pitch, at, length_m / path.speed_mps))
 
 
 def frame_times_s(count: int, fps: float) -> Float64:
@@ -156,18 +154,14 @@ def choose_path(scene: str, path: str, frame: str, num_frames: int, fps: float) 
     name = path or names[0]
     if name in names:
         if frame != "cv":
-            raise ConfigError(
-                f"path_frame = '{frame}': only files have it, the built-in path '{name}' is in 'cv'"
-            )
+            raise ConfigError(f"path_frame = '{frame}': only files have it, the built-in path '{name}' is in 'cv'")
         return name, built_in_path(name, num_frames, fps)
     if name in PATHS:
         raise ConfigError(
             f"path '{name}' belongs to scene '{PATHS[name].scene}'; scene '{scene}' has: {', '.join(names)}"
         )
     if not Path(name).is_file():
-        raise ConfigError(
-            f"path '{name}': no such file, and no path of scene '{scene}', which has: {', '.join(names)}"
-        )
+        raise ConfigError(f"path '{name}': no such file, and no path of scene '{scene}', which has: {', '.join(names)}")
     return Path(name).name.split(".")[0], path_from_file(Path(name), frame, num_frames, fps)
 
 
@@ -177,9 +171,7 @@ def _look(direction: Float64) -> tuple[Float64, Float64]:
     return np.arctan2(x, z), np.arctan2(height, np.hypot(x, z))
 
 
-def _handheld(
-    position: Float64, yaw: Float64, pitch: Float64, phase: Float64, seconds_per_round: float
-) -> Float64:
+def _handheld(position: Float64, yaw: Float64, pitch: Float64, phase: Float64, seconds_per_round: float) -> Float64:
     """T_world_camera (N, 4, 4): a steady view with the sway of a hand, millimetres and tenths of a degree."""
 
     def sway(hertz: float, start: float) -> Float64:

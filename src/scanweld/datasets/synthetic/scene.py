@@ -100,9 +100,7 @@ class Placement:
     The frame of :meth:`at` is turned about the vertical; `turn_deg` 90 turns what faced +z to face +x.
     """
 
-    def __init__(
-        self, rows: list[tuple[Float64, list[float]]], lights: list[list[float]], frame: Float64
-    ) -> None:
+    def __init__(self, rows: list[tuple[Float64, list[float]]], lights: list[list[float]], frame: Float64) -> None:
         self.rows = rows
         self.lights = lights
         self._frame = frame
@@ -113,9 +111,7 @@ class Placement:
         local = np.array([[c, 0, s, x], [0, 1, 0, height], [-s, 0, c, z], [0, 0, 0, 1.0]])
         return Placement(self.rows, self.lights, self._frame @ local)
 
-    def box(
-        self, centre: Vector, size: Vector, material: Material, *, tilt_deg: float = 0.0, seed: int = 0
-    ) -> None:
+    def box(self, centre: Vector, size: Vector, material: Material, *, tilt_deg: float = 0.0, seed: int = 0) -> None:
         """Add a box of full `size`; `tilt_deg` leans its upper end towards +z."""
         c, s = np.cos(np.deg2rad(tilt_deg)), np.sin(np.deg2rad(tilt_deg))
         axes = np.array([[1, 0, 0], [0, c, -s], [0, s, c]])
@@ -145,9 +141,7 @@ class Placement:
         sizes = (radius, half, depth or radius)
         self._add(Shape.FRUSTUM, centre, _axes_along(axis), sizes, material, seed, taper)
 
-    def sheet(
-        self, centre: Vector, width: float, height: float, material: Material, *, seed: int = 0
-    ) -> None:
+    def sheet(self, centre: Vector, width: float, height: float, material: Material, *, seed: int = 0) -> None:
         """Add an upright rectangle that faces z."""
         self._add(Shape.QUAD, centre, np.eye(3), (width / 2, height / 2, 1.0), material, seed)
 

@@ -43,16 +43,12 @@ class RenderConfig:
         "",
         "Camera path: built in (room: orbit, sweep; corridor: loop) or a trajectory file; '': the first.",
     )
-    path_frame: str = setting(
-        "cv", "Axes of a trajectory file: 'cv' (y down), or 'icl' (ICL-NUIM, y up, fy = -480)."
-    )
+    path_frame: str = setting("cv", "Axes of a trajectory file: 'cv' (y down), or 'icl' (ICL-NUIM, y up, fy = -480).")
     noise: str = setting("none", "Depth camera: 'none' (exact), 'kinect' or 'realsense'.")
     frames: int = setting(0, "Number of frames; 0 is one round of a built-in path, or all of a file.", low=0)
     width: int = setting(640, "Image width [px]; the focal length is 525 px at 640.", low=16, high=8192)
     height: int = setting(480, "Image height [px].", low=16, high=8192)
-    fps: float = setting(
-        30.0, "Frames per second [1/s]; a higher rate makes the steps smaller.", low=0.1, high=1000.0
-    )
+    fps: float = setting(30.0, "Frames per second [1/s]; a higher rate makes the steps smaller.", low=0.1, high=1000.0)
     seed: int = setting(0, "Seed of the noise and of small things in the scene.", low=0)
 
     def __post_init__(self) -> None:
@@ -67,9 +63,7 @@ class RenderConfig:
         if self.width * 3 == self.height * 4:
             return STANDARD_CAMERA.scaled(self.width / STANDARD_CAMERA.width)
         focal = STANDARD_CAMERA.fx * self.width / STANDARD_CAMERA.width
-        return PinholeCamera(
-            focal, focal, (self.width - 1) / 2, (self.height - 1) / 2, self.width, self.height
-        )
+        return PinholeCamera(focal, focal, (self.width - 1) / 2, (self.height - 1) / 2, self.width, self.height)
 
 
 class SyntheticSequence:
@@ -129,9 +123,7 @@ class SyntheticSequence:
         color, depth_m = render_frame(scene, self.camera, self._trajectory.T_world_camera[index])
         if not self._warned and (depth_m == 0).mean() > 0.2:
             self._warned = True
-            logger.warning(
-                "frame %d of %s looks out of the scene; wrong --path-frame or scene?", index, self.name
-            )
+            logger.warning("frame %d of %s looks out of the scene; wrong --path-frame or scene?", index, self.name)
         return color, depth_m
 
     def read_stored(self, index: int) -> tuple[UInt8, Array]:

@@ -49,9 +49,7 @@ def space(p: Placement, width: float, depth: float, style: Style, doors: str) ->
     return Space(p, back, left, front, right)
 
 
-def _wall(
-    p: Placement, length: float, wall: Material, panel: Material | None, door: bool, *, seed: int
-) -> None:
+def _wall(p: Placement, length: float, wall: Material, panel: Material | None, door: bool, *, seed: int) -> None:
     """Build a wall behind z = 0, with a framed doorway in its middle if asked, skirting, and wainscot."""
     half, gap = length / 2, DOOR_WIDTH / 2
     parts = [(-half, -gap), (gap, half)] if door else [(-half, half)]

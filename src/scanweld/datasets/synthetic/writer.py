@@ -65,9 +65,7 @@ def _refuse_to_overwrite(target: Path, force: bool) -> None:
             raise OutputError(f"{target}: holds something else than a sequence; it is not replaced")
 
 
-def _write_frames(
-    folder: Path, sequence: SyntheticSequence, progress: Callable[[int, int], None] | None
-) -> None:
+def _write_frames(folder: Path, sequence: SyntheticSequence, progress: Callable[[int, int], None] | None) -> None:
     """Write the images and the lists that name them."""
     stamps = [f"{time:.6f}" for time in sequence.timestamps_s]
     lists = {
@@ -81,9 +79,7 @@ def _write_frames(
     (folder / "depth").mkdir()
     for index, stamp in enumerate(stamps):
         color, depth = sequence.read_stored(index)
-        _write_png(
-            folder / "rgb" / f"{stamp}.png", np.ascontiguousarray(color[..., ::-1])
-        )  # OpenCV wants BGR
+        _write_png(folder / "rgb" / f"{stamp}.png", np.ascontiguousarray(color[..., ::-1]))  # OpenCV wants BGR
         _write_png(folder / "depth" / f"{stamp}.png", depth)
         if progress is not None:
             progress(index + 1, len(stamps))

@@ -1,0 +1,175 @@
+"""Register point sets and build dense 3-D maps from RGB-D video.
+
+The public names are loaded when they are first used, so that `import scanweld` is quick: Numba, OpenCV and SciPy
+come with the first call that needs them.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from scanweld.config import from_mapping, to_toml
+    from scanweld.datasets.base import RgbdSequence
+    from scanweld.datasets.open import open_sequence
+    from scanweld.datasets.stream import stream
+    from scanweld.datasets.synthetic import RenderConfig, SyntheticSequence, render_sequence
+    from scanweld.errors import (
+        ConfigError,
+        DatasetError,
+        FileFormatError,
+        InvalidInputError,
+        MissingDependencyError,
+        OutputError,
+        ScanweldError,
+        UnreadableFrameError,
+    )
+    from scanweld.evaluation.surface_metrics import surface_accuracy, surface_completeness
+    from scanweld.evaluation.trajectory_metrics import ate, rpe
+    from scanweld.geometry import se3
+    from scanweld.geometry.camera import PinholeCamera
+    from scanweld.geometry.depth import SurfaceConfig, SurfacePyramid, build_pyramid
+    from scanweld.geometry.frame import Frame
+    from scanweld.geometry.normals import estimate_normals
+    from scanweld.geometry.point_cloud import PointCloud, voxel_downsample
+    from scanweld.geometry.views import MapCorrection, ModelView
+    from scanweld.io.ply import read_ply, write_ply
+    from scanweld.io.point_files import read_points
+    from scanweld.io.trajectory_files import read_trajectory, write_tum
+    from scanweld.loop_closure.loop_closer import NoLoopCloser
+    from scanweld.mapping.fusion import FusionConfig
+    from scanweld.mapping.mapper import SurfelMapper
+    from scanweld.mapping.rendering import render_picture
+    from scanweld.mapping.surfel_map import SurfelMap
+    from scanweld.parallel import set_num_threads
+    from scanweld.registration.closed_form import align_closed_form
+    from scanweld.registration.icp import IcpConfig, icp
+    from scanweld.registration.projective import ProjectiveConfig
+    from scanweld.registration.result import RegistrationResult, Status
+    from scanweld.runs.run import RunSummary, run_sequence
+    from scanweld.slam.system import Slam, SlamConfig, build_slam
+    from scanweld.tracking.tracker import FrameToModelTracker, TrackingConfig
+    from scanweld.tracking.two_frames import TwoFrameConfig, align_frames
+    from scanweld.trajectory import FrameResult, FrameState, Trajectory
+
+_HOME = {
+    "config": ("from_mapping", "to_toml"),
+    "datasets.base": ("RgbdSequence",),
+    "datasets.open": ("open_sequence",),
+    "datasets.stream": ("stream",),
+    "datasets.synthetic": ("RenderConfig", "SyntheticSequence", "render_sequence"),
+    "errors": (
+        "ConfigError", "DatasetError", "FileFormatError", "InvalidInputError", "MissingDependencyError", "OutputError",
+        "ScanweldError", "UnreadableFrameError",
+    ),
+    "evaluation.surface_metrics": ("surface_accuracy", "surface_completeness"),
+    "evaluation.trajectory_metrics": ("ate", "rpe"),
+    "geometry": ("se3",),
+    "geometry.camera": ("PinholeCamera",),
+    "geometry.depth": ("SurfaceConfig", "SurfacePyramid", "build_pyramid"),
+    "geometry.frame": ("Frame",),
+    "geometry.normals": ("estimate_normals",),
+    "geometry.point_cloud": ("PointCloud", "voxel_downsample"),
+    "geometry.views": ("MapCorrection", "ModelView"),
+    "io.ply": ("read_ply", "write_ply"),
+    "io.point_files": ("read_points",),
+    "io.trajectory_files": ("read_trajectory", "write_tum"),
+    "loop_closure.loop_closer": ("NoLoopCloser",),
+    "mapping.fusion": ("FusionConfig",),
+    "mapping.mapper": ("SurfelMapper",),
+    "mapping.rendering": ("render_picture",),
+    "mapping.surfel_map": ("SurfelMap",),
+    "parallel": ("set_num_threads",),
+    "registration.closed_form": ("align_closed_form",),
+    "registration.icp": ("IcpConfig", "icp"),
+    "registration.projective": ("ProjectiveConfig",),
+    "registration.result": ("RegistrationResult", "Status"),
+    "runs.run": ("RunSummary", "run_sequence"),
+    "slam.system": ("Slam", "SlamConfig", "build_slam"),
+    "tracking.tracker": ("FrameToModelTracker", "TrackingConfig"),
+    "tracking.two_frames": ("TwoFrameConfig", "align_frames"),
+    "trajectory": ("FrameResult", "FrameState", "Trajectory"),
+}  # fmt: skip
+_MODULE_OF = {name: module for module, names in _HOME.items() for name in names}
+
+__all__ = [
+    "ConfigError",
+    "DatasetError",
+    "FileFormatError",
+    "Frame",
+    "FrameResult",
+    "FrameState",
+    "FrameToModelTracker",
+    "FusionConfig",
+    "IcpConfig",
+    "InvalidInputError",
+    "MapCorrection",
+    "MissingDependencyError",
+    "ModelView",
+    "NoLoopCloser",
+    "OutputError",
+    "PinholeCamera",
+    "PointCloud",
+    "ProjectiveConfig",
+    "RegistrationResult",
+    "RenderConfig",
+    "RgbdSequence",
+    "RunSummary",
+    "ScanweldError",
+    "Slam",
+    "SlamConfig",
+    "Status",
+    "SurfaceConfig",
+    "SurfacePyramid",
+    "SurfelMap",
+    "SurfelMapper",
+    "SyntheticSequence",
+    "TrackingConfig",
+    "Trajectory",
+    "TwoFrameConfig",
+    "UnreadableFrameError",
+    "align_closed_form",
+    "align_frames",
+    "ate",
+    "build_pyramid",
+    "build_slam",
+    "estimate_normals",
+    "from_mapping",
+    "icp",
+    "open_sequence",
+    "read_ply",
+    "read_points",
+    "read_trajectory",
+    "render_picture",
+    "render_sequence",
+    "rpe",
+    "run_sequence",
+    "se3",
+    "set_num_threads",
+    "stream",
+    "surface_accuracy",
+    "surface_completeness",
+    "to_toml",
+    "voxel_downsample",
+    "write_ply",
+    "write_tum",
+]
+
+
+def __getattr__(name: str) -> Any:
+    module = _MODULE_OF.get(name)
+    if module is None:
+        raise AttributeError(f"module 'scanweld' has no attribute {name!r}")
+    # A submodule is itself the value; anything else is in its module.
+    value = (
+        import_module(f"scanweld.{module}.{name}")
+        if name == "se3"
+        else getattr(import_module(f"scanweld.{module}"), name)
+    )
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

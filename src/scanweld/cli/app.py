@@ -1,0 +1,69 @@
+"""The command table, and how an error becomes one line and an exit code.
+
+Exit codes: 0 done; 1 a known error, one line; 2 usage; 3 done, but without a trustworthy answer; 130 Ctrl-C.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+from collections.abc import Sequence
+from typing import Annotated
+
+import typer
+
+from scanweld.cli.demo import demo
+from scanweld.cli.evaluate import evaluate
+from scanweld.cli.register import register
+from scanweld.cli.render import render
+from scanweld.cli.slam import slam
+from scanweld.errors import ScanweldError
+
+app = typer.Typer(
+    name="scanweld",
+    help="Register point sets and build dense 3-D maps from RGB-D video.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+for command in (demo, slam, register, evaluate, render):
+    app.command()(command)
+
+
+@app.callback(invoke_without_command=True)
+def options(
+    version: Annotated[bool, typer.Option("--version", help="Print the version and exit.")] = False,
+) -> None:
+    """Register point sets and build dense 3-D maps from RGB-D video."""
+    if version:
+        from importlib.metadata import version as installed
+
+        typer.echo(installed("scanweld"))
+        raise typer.Exit
+
+
+def run(arguments: Sequence[str]) -> int:
+    """Run one command line and return its exit code."""
+    logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s", stream=sys.stderr, force=True)
+    logging.addLevelName(logging.WARNING, "warning")
+    command = typer.main.get_command(app)
+    try:
+        code = command.main(list(arguments), prog_name="scanweld", standalone_mode=False)
+    except ScanweldError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    except (KeyboardInterrupt, typer.Abort):
+        print("interrupted; nothing was written", file=sys.stderr)
+        return 130
+    except BrokenPipeError:  # the reader of a pipe has gone: no more to say, and no traceback at exit
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except Exception as error:
+        # Usage errors of the parser carry their exit code and know how to show themselves.
+        show = getattr(error, "show", None)
+        if show is None:
+            raise
+        show()
+        return int(getattr(error, "exit_code", 2))
+    return int(code or 0)

@@ -1,0 +1,162 @@
+"""`scanweld slam`: from a sequence to a trajectory, a map and an evaluation."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from scanweld.datasets.base import RgbdSequence
+    from scanweld.runs.run import RunSummary
+    from scanweld.slam.system import SlamConfig
+    from scanweld.trajectory import Trajectory
+
+Option = typer.Option
+
+
+def slam(
+    sequence: Annotated[Path, typer.Argument(help="Sequence folder: TUM, Redwood, 7-Scenes, ICL-NUIM.")],
+    out: Annotated[Path | None, Option(help="Run folder. Default: runs/SEQUENCE-N.", metavar="RUN")] = None,
+    format_name: Annotated[str, Option("--format", help="auto, tum, redwood, 7scenes or icl.")] = "auto",
+    camera: Annotated[str | None, Option(help="Intrinsics of the images on disk.", metavar="FX,FY,CX,CY")] = None,
+    depth_scale: Annotated[float | None, Option(help="Depth units per metre, for example 5000.")] = None,
+    frames: Annotated[str | None, Option(help="Use a part of the frames.", metavar="A:B[:STEP]")] = None,
+    scale: Annotated[float, Option(help="Resize the images, for example 0.5.")] = 1.0,
+    poses: Annotated[str | None, Option(help="Fuse at given poses instead of tracking.", metavar="truth|FILE")] = None,
+    config: Annotated[Path | None, Option(help="Configuration file.", metavar="F.toml")] = None,
+    overrides: Annotated[
+        list[str] | None, Option("--set", help="Set one value, for example tracking.stable_fraction=0.1.")
+    ] = None,
+    threads: Annotated[int | None, Option(help="Number of threads. Default: all cores.", min=1)] = None,
+    tracked_only: Annotated[
+        bool, Option("--tracked-only", help="Leave frames without a measured pose out of trajectory.txt.")
+    ] = False,
+    force: Annotated[bool, Option("--force", help="Replace an existing run.")] = False,
+    json_output: Annotated[bool, Option("--json", help="Print the metrics as one JSON object.")] = False,
+) -> int:
+    """Track the camera through an RGB-D sequence and fuse a coloured surfel map.
+
+    Exit code 3 says that the run ended LOST or tracked fewer than half of the frames; its folder is complete.
+    """
+    started = time.perf_counter()
+    from scanweld.datasets.intrinsics import parse_intrinsics
+    from scanweld.datasets.open import open_sequence
+
+    settings = load_config(config, overrides or [])
+    opened = open_sequence(
+        sequence,
+        format=format_name,
+        camera=parse_intrinsics(camera) if camera else None,
+        depth_scale=depth_scale,
+        frames=frames,
+        scale=scale,
+    )
+    from scanweld.runs.folder import next_run_folder
+
+    folder = out or next_run_folder(sequence.resolve().name)
+    given = None if poses is None else given_poses(opened, poses)
+    description = {
+        "input": str(sequence.resolve()), "format": format_name, "frames": frames, "scale": scale, "poses": poses,
+        "camera": camera, "depth_scale": depth_scale, "config": str(config) if config else None,
+        "set": overrides or [],
+    }  # fmt: skip
+    summary = run_with_progress(
+        opened, settings, folder, force=force, poses=given, threads=threads, tracked_only=tracked_only,
+        description=description, started=started,
+    )  # fmt: skip
+    return print_summary(summary, json_output=json_output)
+
+
+def load_config(path: Path | None, overrides: list[str]) -> SlamConfig:
+    """Return the configuration: defaults < file < `--set`."""
+    from scanweld.config import from_mapping, load_toml, merge, parse_override
+    from scanweld.slam.system import SlamConfig
+
+    values: dict[str, Any] = load_toml(path) if path else {}
+    if path is not None:
+        from_mapping(SlamConfig, values, str(path))  # a fault in the file is told with the file's name
+    for text in overrides:
+        values = merge(values, parse_override(text))
+    return from_mapping(SlamConfig, values, "--set" if overrides else str(path))
+
+
+def given_poses(sequence: RgbdSequence, source: str) -> Trajectory:
+    """Return the true poses of a sequence, or those of a file."""
+    from scanweld.errors import DatasetError
+    from scanweld.io.trajectory_files import read_trajectory
+
+    if source != "truth":
+        return read_trajectory(source)
+    if sequence.ground_truth is None:
+        raise DatasetError(f"{sequence.name}: has no ground truth; --poses FILE takes a trajectory file")
+    return sequence.ground_truth
+
+
+def run_with_progress(
+    sequence: RgbdSequence,
+    config: SlamConfig,
+    folder: Path,
+    *,
+    threads: int | None = None,
+    title: str = "slam",
+    started: float,
+    **options: Any,
+) -> RunSummary:
+    """Run a sequence with progress on standard error."""
+    from scanweld.cli.progress import FrameProgress
+    from scanweld.parallel import set_num_threads
+    from scanweld.runs.folder import check_writable
+    from scanweld.runs.run import run_sequence
+    from scanweld.slam.warmup import compile_kernels
+
+    if threads is not None:
+        set_num_threads(threads)
+    check_writable(folder, force=options.get("force", False))
+    with FrameProgress(len(sequence), title) as progress:
+        compile_kernels(lambda part: progress.say(f"compiling, once for this machine: {part}"))
+        return run_sequence(sequence, config, out=folder, progress=progress.update, started=started, **options)
+
+
+def print_summary(summary: RunSummary, *, json_output: bool) -> int:
+    """Print what a run came to and return its exit code."""
+    if json_output:
+        typer.echo(json.dumps(summary.metrics))
+    else:
+        typer.echo(summary_text(summary))
+    if summary.interrupted:
+        return 130
+    if not summary.trustworthy:
+        m = summary.metrics
+        print(
+            f"warning: tracked {m['frames_tracked']} of {m['frames']} frames, last frame "
+            f"{summary.results[-1].state.name}: frames.csv says why",
+            file=sys.stderr,
+        )
+        return 3
+    return 0
+
+
+def summary_text(summary: RunSummary) -> str:
+    """Return the summary of a run as lines for a person."""
+    m = summary.metrics
+    lost = [f"{m['frames_lost']} lost"] if m["frames_lost"] else []
+    lost += [f"{m['frames_unreadable']} unreadable"] if m["frames_unreadable"] else []
+    rows = [
+        ("frames", f"{m['frames_tracked']} of {m['frames']} tracked" + "".join(f", {x}" for x in lost)),
+        ("map", f"{m['num_surfels']:,} surfels from {m['num_points_input']:,} points"),
+        ("path", f"{m['path_length_m']:.2f} m"),
+    ]
+    if m["ate_rmse_m"] is not None:
+        rows.append(("ATE", f"{m['ate_rmse_m'] * 1e3:.2f} mm rmse, {m['ate_max_m'] * 1e3:.2f} mm at most"))
+    if m["rpe_trans_m"] is not None:
+        rows.append(("RPE", f"{m['rpe_trans_m'] * 1e3:.2f} mm and {m['rpe_rot_deg']:.3f} deg a frame"))
+    if m["fps"] is not None:
+        rows.append(("speed", f"{m['fps']:.1f} frames a second; {m['seconds_total']:.1f} s in all"))
+    if summary.folder is not None:
+        rows.append(("written", f"{summary.folder}/"))
+    return "\n".join(f"{name:<8} {text}" for name, text in rows)

@@ -1,0 +1,340 @@
+"""Decode and resize depth and colour images.
+
+A damaged file is found before it reaches the decoder (every PNG chunk has a checksum, a JPEG ends with a
+marker), because decoders fill what is missing with whatever they like. The size in the header is compared
+with the expected one before anything is allocated. OpenCV loads on the first decode.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from scanweld.arrays import Array, Bool, Float32, UInt8
+from scanweld.errors import DatasetError, InvalidInputError, UnreadableFrameError
+
+MAX_PIXELS = 1 << 26
+"""Largest image that is decoded; a damaged header must not allocate gigabytes."""
+
+MAX_DEPTH_M = 65535.0
+"""Depth beyond this is no measurement in any unit; the mapper has its own, much shorter range."""
+
+SURFACE_BAND = 0.02
+"""Depths that differ by less than this share of the depth belong to one surface when an image is resized."""
+
+PLAUSIBLE_MEDIAN_M = (0.15, 5.5)
+"""Median depth of a scene in front of an RGB-D camera, from a shelf bin at arm's length to a hall [m]."""
+
+_KNOWN_DEPTH_SCALES = (1000.0, 5000.0, 1.0, 100.0, 10000.0, 6553.5)  # likeliest first
+_PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
+_PNG_CHANNELS = {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}
+
+
+@dataclass(frozen=True, slots=True)
+class ImageHeader:
+    """What an intact image file says about itself."""
+
+    width: int
+    height: int
+    bits: int
+    channels: int
+
+
+def read_header(path: Path) -> ImageHeader:
+    """Return the header of a PNG or JPEG file, after checking that the file is complete.
+
+    Raises
+    ------
+    UnreadableFrameError
+        When the file is missing, truncated, damaged, or neither PNG nor JPEG.
+    """
+    return _intact(path, _read_bytes(path))
+
+
+def read_color(path: Path, shape: tuple[int, int]) -> UInt8:
+    """Decode a PNG or JPEG file as RGB (H, W, 3) uint8; grey, 16-bit and transparent images are converted.
+
+    Raises
+    ------
+    UnreadableFrameError
+        When the file is damaged or not of the expected `shape` (height, width).
+    """
+    import cv2
+
+    data = _read_bytes(path)
+    _require_shape(path, _intact(path, data), shape)
+    # A camera that was held upright writes an EXIF orientation; the depth image has none.
+    image = _decode(path, data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    color: UInt8 = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+    return color
+
+
+def read_depth_png(path: Path, shape: tuple[int, int], depth_scale: float) -> Float32:
+    """Decode a 16-bit PNG as metres (H, W) float32, 0 where the sensor saw nothing (0 and 65535 in the file).
+
+    Parameters
+    ----------
+    path : file
+    shape : expected (height, width)
+    depth_scale : units in the file per metre
+
+    Raises
+    ------
+    UnreadableFrameError
+        When the file is damaged, not of the expected shape, or not one channel of 16 bits.
+    """
+    import cv2
+
+    data = _read_bytes(path)
+    header = _intact(path, data)
+    _require_shape(path, header, shape)
+    fault = depth_header_fault(header)
+    if fault:
+        raise UnreadableFrameError(f"{path}: {fault}")
+    raw = _decode(path, data, cv2.IMREAD_UNCHANGED)
+    depth: Float32 = np.divide(raw, np.float32(depth_scale), dtype=np.float32)
+    depth[raw == 65535] = 0
+    return depth
+
+
+def depth_header_fault(header: ImageHeader) -> str:
+    """Say why an image cannot be a depth image, or return ""."""
+    if header.bits == 16 and header.channels == 1:
+        return ""
+    what = f"{header.bits} bits, {header.channels} channel{'s' if header.channels > 1 else ''}"
+    hint = "are colour and depth swapped?" if header.channels >= 3 else "export the raw depth, not a preview of it"
+    return f"not a depth image: it has {what}, expected one channel of 16 bits; {hint}"
+
+
+def read_ray_distance_text(path: Path, shape: tuple[int, int], depth_scale: float) -> Float32:
+    """Read H * W numbers, row by row, as (H, W) float32 [m]; what is not a positive finite number becomes 0.
+
+    Raises
+    ------
+    UnreadableFrameError
+        When the file is missing, holds something else than numbers, or not H * W of them.
+    """
+    data = _read_bytes(path)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", DeprecationWarning)  # how NumPy reports text that is no number
+        try:
+            values = np.fromstring(data.decode("ascii"), dtype=np.float32, sep=" ")
+        except (ValueError, DeprecationWarning):
+            raise UnreadableFrameError(f"{path}: expected numbers separated by blanks") from None
+    height, width = shape
+    if values.size != height * width:
+        raise UnreadableFrameError(
+            f"{path}: expected {width} x {height} = {width * height} numbers, got {values.size}; truncated?"
+        )
+    return valid_depth(values.reshape(shape) / np.float32(depth_scale))
+
+
+def valid_depth(depth_m: Array) -> Float32:
+    """Return depth (H, W) [m] as float32 with NaN, infinite, negative and absurd values mapped to 0."""
+    depth = np.asarray(depth_m, dtype=np.float32)
+    valid = np.isfinite(depth) & (depth > 0) & (depth < MAX_DEPTH_M)
+    return np.where(valid, depth, np.float32(0))
+
+
+def resize_depth(depth_m: Float32, shape: tuple[int, int]) -> Float32:
+    """Resize depth (H, W) [m] to `shape` without mixing surfaces; pixel centres as `PinholeCamera.scaled`.
+
+    The footprint of an output pixel is sampled by a regular grid of input pixels. The surface is the one that
+    most of the valid samples agree with to ``SURFACE_BAND``, the nearer of two equals. The samples on it are
+    averaged in inverse depth, which is linear over the pixels of a plane: a plane comes out exactly, at the
+    pixel centre between the samples. Enlarging takes the nearest pixel.
+    """
+    rows = _footprint(depth_m.shape[0], shape[0])
+    columns = _footprint(depth_m.shape[1], shape[1])
+    samples = [depth_m[r][:, c] for r in rows for c in columns]
+    if len(samples) == 1:
+        return np.ascontiguousarray(samples[0])
+    surface = np.zeros(shape, dtype=np.float32)
+    most = np.zeros(shape, dtype=np.int16)
+    for candidate in samples:
+        votes = sum(same.astype(np.int16) for same in _on_surface(samples, candidate))
+        better = (votes > most) | ((votes == most) & (candidate < surface))
+        np.copyto(surface, candidate, where=better)
+        np.copyto(most, votes, where=better)
+    total = np.zeros(shape, dtype=np.float32)
+    with np.errstate(divide="ignore"):  # 1 / 0 is not taken
+        for sample, same in zip(samples, _on_surface(samples, surface), strict=True):
+            np.add(total, 1 / sample, out=total, where=same)
+    result = np.zeros(shape, dtype=np.float32)
+    np.divide(most, total, out=result, where=most > 0)
+    return result
+
+
+def _on_surface(samples: list[Float32], surface_m: Float32) -> Iterator[Bool]:
+    """For each sample image, where it is valid and within the band of the surface."""
+    tolerance = np.float32(SURFACE_BAND) * surface_m
+    for sample in samples:
+        yield np.abs(sample - surface_m) < tolerance  # never where the surface is 0
+
+
+def _footprint(size_in: int, size_out: int) -> Array:
+    """Input indices (n, size_out) that sample the footprint of each output pixel, about its centre."""
+    step = size_in / size_out
+    n = max(1, math.ceil(step - 1e-9))
+    offsets = (np.arange(n)[:, None] + 0.5) / n * step
+    # In the continuous coordinate of the input, pixel i spans [i, i + 1).
+    indices = np.floor(np.arange(size_out) * step + offsets + 1e-9).astype(np.int64)
+    return np.clip(indices, 0, size_in - 1)
+
+
+def resize_color(color: UInt8, shape: tuple[int, int]) -> UInt8:
+    """Resize an image (H, W, 3) to `shape`; shrinking averages the area of each output pixel."""
+    import cv2
+
+    height, width = shape
+    shrinks = height <= color.shape[0] and width <= color.shape[1]
+    resized: UInt8 = cv2.resize(color, (width, height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
+    return resized
+
+
+def check_depth_unit(median_depth_m: float, depth_scale: float) -> str | None:
+    """Say in one line what is wrong with the depth unit, or return None when the depth is plausible.
+
+    Parameters
+    ----------
+    median_depth_m : median of the valid depth of the first frames [m], or 0 when there is none
+    depth_scale : units per metre that the depth was read with
+
+    Notes
+    -----
+    A unit that makes the scene five times too near is not seen here: a shelf at 0.4 m is as plausible as a
+    room at 2 m.
+    """
+    if not median_depth_m > 0:
+        return "no valid depth in the first frames: is the depth folder the right one?"
+    low, high = PLAUSIBLE_MEDIAN_M
+    if low <= median_depth_m <= high:
+        return None
+    raw = median_depth_m * depth_scale
+    likely = [scale for scale in _KNOWN_DEPTH_SCALES if low <= raw / scale <= high]
+    seen = f"the median depth is {median_depth_m:.3g} m with {depth_scale:g} units per metre"
+    if not likely:
+        return f"{seen}, which is implausible; pass --depth-scale (units per metre of the depth images)"
+    scale = likely[0]
+    return f"{seen}; the unit is likely {_unit(scale)} ({raw / scale:.3g} m): pass --depth-scale {scale:g}"
+
+
+def _unit(depth_scale: float) -> str:
+    names = {1.0: "1 m", 100.0: "1 cm", 1000.0: "1 mm", 10000.0: "0.1 mm", 5000.0: "0.2 mm (TUM)"}
+    return names.get(depth_scale, f"1/{depth_scale:g} m")
+
+
+def _read_bytes(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise UnreadableFrameError(f"{path}: {error.strerror or error}") from None
+
+
+def _decode(path: Path, data: bytes, flags: int) -> Array:
+    import cv2
+
+    try:
+        image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags)
+    except cv2.error as error:
+        raise UnreadableFrameError(f"{path}: cannot be decoded ({error.err})") from None
+    if image is None:
+        raise UnreadableFrameError(f"{path}: cannot be decoded; the file is damaged")
+    return np.asarray(image)
+
+
+def _require_shape(path: Path, header: ImageHeader, shape: tuple[int, int]) -> None:
+    if (header.height, header.width) != shape:
+        raise UnreadableFrameError(
+            f"{path}: the image is {header.width}x{header.height}, the sequence {shape[1]}x{shape[0]}"
+        )
+
+
+def _intact(path: Path, data: bytes) -> ImageHeader:
+    if data.startswith(_PNG_MAGIC):
+        header = _png_header(data)
+    elif data.startswith(b"\xff\xd8"):
+        header = _jpeg_header(data)
+    elif not data:
+        raise UnreadableFrameError(f"{path}: the file is empty")
+    else:
+        raise UnreadableFrameError(f"{path}: neither PNG nor JPEG (starts with {data[:4]!r})")
+    if isinstance(header, str):
+        raise UnreadableFrameError(f"{path}: {header}")
+    if not 0 < header.width * header.height <= MAX_PIXELS:
+        raise UnreadableFrameError(f"{path}: the header claims {header.width}x{header.height} pixels")
+    return header
+
+
+def _png_header(data: bytes) -> ImageHeader | str:
+    """Walk the chunks (PNG specification, section 5); return the header, or what is wrong."""
+    if len(data) < 33 or data[12:16] != b"IHDR":
+        return "truncated PNG"
+    view, position = memoryview(data), 8
+    while position + 12 <= len(data):
+        end = position + 12 + int.from_bytes(view[position : position + 4], "big")
+        if end > len(data):
+            break
+        if zlib.crc32(view[position + 4 : end - 4]) != int.from_bytes(view[end - 4 : end], "big"):
+            return "damaged PNG (checksum)"
+        if data[position + 4 : position + 8] == b"IEND":
+            width, height = int.from_bytes(view[16:20], "big"), int.from_bytes(view[20:24], "big")
+            return ImageHeader(width, height, data[24], _PNG_CHANNELS.get(data[25], 0))
+        position = end
+    return f"truncated PNG ({len(data)} bytes)"
+
+
+def _jpeg_header(data: bytes) -> ImageHeader | str:
+    """Walk the segments to the first scan (ITU T.81, annex B); return the header, or what is wrong."""
+    header: ImageHeader | None = None
+    position = 2
+    while position + 4 <= len(data) and data[position] == 0xFF:
+        marker = data[position + 1]
+        if marker == 0xFF:  # fill byte
+            position += 1
+            continue
+        length = int.from_bytes(data[position + 2 : position + 4], "big")
+        is_frame = 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC)
+        if is_frame and position + 10 <= len(data):
+            height = int.from_bytes(data[position + 5 : position + 7], "big")
+            width = int.from_bytes(data[position + 7 : position + 9], "big")
+            header = ImageHeader(width, height, data[position + 4], data[position + 9])
+        position += 2 + length
+        if marker == 0xDA:
+            # Inside a scan 0xFF is always followed by a stuffed zero or a restart: this is the end marker.
+            if header is None or data.find(b"\xff\xd9", position) < 0:
+                break
+            return header
+    return f"truncated JPEG ({len(data)} bytes)"
+
+
+def require_scale(scale: float) -> float:
+    """Return an image scale factor after checking its range.
+
+    Raises
+    ------
+    InvalidInputError
+        When it is not within (0, 4].
+    """
+    if not (math.isfinite(scale) and 0 < scale <= 4):
+        raise InvalidInputError(f"scale: expected a factor above 0 and up to 4, got {scale}")
+    return scale
+
+
+def require_depth_scale(depth_scale: float, where: str) -> float:
+    """Return a depth scale after checking that it is a positive number.
+
+    Raises
+    ------
+    DatasetError
+        When it is not.
+    """
+    if not (math.isfinite(depth_scale) and depth_scale > 0):
+        raise DatasetError(f"{where}: depth_scale must be positive (units per metre, e.g. 1000), got {depth_scale}")
+    return depth_scale

@@ -1,0 +1,143 @@
+"""Which intrinsics and depth unit a sequence has, and who decides: the caller, camera.json, the format."""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from scanweld.errors import DatasetError, InvalidInputError
+from scanweld.geometry.camera import PinholeCamera
+
+logger = logging.getLogger(__name__)
+
+Intrinsics = tuple[float, float, float, float]
+"""fx, fy, cx, cy in pixels."""
+
+CAMERA_FILE = "camera.json"
+
+
+@dataclass(frozen=True, slots=True)
+class CameraFile:
+    """What camera.json says; None where it does not say it."""
+
+    intrinsics: Intrinsics
+    size: tuple[int, int] | None  # width, height
+    depth_scale: float | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Overrides:
+    """What the caller fixed; None leaves it to camera.json and the format.
+
+    Attributes
+    ----------
+    camera : intrinsics of the images as they are on disk, with or without their size
+    depth_scale : units per metre of the depth images
+    """
+
+    camera: PinholeCamera | Intrinsics | None = None
+    depth_scale: float | None = None
+
+
+def parse_intrinsics(text: str) -> Intrinsics:
+    """Turn "FX,FY,CX,CY" into four numbers.
+
+    Raises
+    ------
+    InvalidInputError
+        When the text is not four numbers.
+    """
+    try:
+        fx, fy, cx, cy = (float(part) for part in text.split(","))
+    except ValueError:
+        raise InvalidInputError(
+            f"camera: expected FX,FY,CX,CY, for example 525,525,319.5,239.5, got '{text}'"
+        ) from None
+    return fx, fy, cx, cy
+
+
+def make_camera(intrinsics: Intrinsics, width: int, height: int, where: str) -> PinholeCamera:
+    """Return the camera of images of the given size.
+
+    A negative fy (ICL-NUIM prints -480) describes a y axis that points up; the images are upright all the
+    same, so it is taken as positive.
+
+    Raises
+    ------
+    DatasetError
+        When the intrinsics are not finite or not positive.
+    """
+    fx, fy, cx, cy = intrinsics
+    if fy < 0:
+        logger.info("%s: fy = %g is taken as %g (the camera's y axis points down)", where, fy, -fy)
+        fy = -fy
+    try:
+        return PinholeCamera(fx, fy, cx, cy, width, height)
+    except InvalidInputError as error:
+        raise DatasetError(f"{where}: {error}") from None
+
+
+def scaled_default(intrinsics: Intrinsics, width: int, height: int) -> Intrinsics:
+    """Scale intrinsics of 640x480 images to another size, pixel centres as in `PinholeCamera.scaled`."""
+    fx, fy, cx, cy = intrinsics
+    sx, sy = width / 640, height / 480
+    return fx * sx, fy * sy, (cx + 0.5) * sx - 0.5, (cy + 0.5) * sy - 0.5
+
+
+def read_camera_file(folder: Path) -> CameraFile | None:
+    """Read `camera.json` of a sequence folder: fx, fy, cx, cy and optionally width, height, depth_scale.
+
+    Returns None when there is none.
+
+    Raises
+    ------
+    DatasetError
+        When it is not JSON, or a value is missing or not a positive number.
+    """
+    path = folder / CAMERA_FILE
+    if not path.is_file():
+        return None
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise DatasetError(f"{path}: not a readable JSON file: {error}") from None
+    if not isinstance(values, dict):
+        raise DatasetError(f"{path}: expected an object with fx, fy, cx, cy, width, height, depth_scale")
+    fx, fy, cx, cy = (_number(path, values, key) for key in ("fx", "fy", "cx", "cy"))
+    size = None
+    if "width" in values or "height" in values:
+        size = int(_number(path, values, "width")), int(_number(path, values, "height"))
+    depth_scale = _number(path, values, "depth_scale") if "depth_scale" in values else None
+    return CameraFile((fx, fy, cx, cy), size, depth_scale)
+
+
+def _number(path: Path, values: Mapping[str, Any], key: str) -> float:
+    value = values.get(key)
+    if not isinstance(value, (int, float)) or isinstance(value, bool) or not math.isfinite(value):
+        raise DatasetError(f"{path}: '{key}' must be a number, got {value!r}")
+    return float(value)
+
+
+def read_intrinsics_matrix(path: Path) -> Intrinsics:
+    """Read a text file with a 3x3 matrix K as fx, fy, cx, cy.
+
+    Raises
+    ------
+    DatasetError
+        When the file does not hold an upper triangular 3x3 matrix ending in 0 0 1.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+        rows = [[float(word) for word in line.replace(",", " ").split()] for line in text.splitlines() if line.strip()]
+    except (OSError, ValueError) as error:
+        raise DatasetError(f"{path}: not a readable 3x3 matrix: {error}") from None
+    if [len(row) for row in rows] != [3, 3, 3] or rows[2] != [0, 0, 1] or rows[1][0] != 0:
+        raise DatasetError(f"{path}: expected the 3x3 matrix (fx 0 cx) (0 fy cy) (0 0 1)")
+    if abs(rows[0][1]) > 1e-6 * abs(rows[0][0]):
+        logger.warning("%s: the skew %g is ignored", path, rows[0][1])
+    return rows[0][0], rows[1][1], rows[0][2], rows[1][2]

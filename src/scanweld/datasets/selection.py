@@ -1,0 +1,153 @@
+"""Parts and smaller versions of a sequence; they wrap any :class:`~scanweld.datasets.base.RgbdSequence`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from scanweld.arrays import Float64
+from scanweld.datasets.base import RgbdSequence, readable_frames
+from scanweld.datasets.images import require_scale, resize_color, resize_depth
+from scanweld.errors import InvalidInputError
+from scanweld.geometry.camera import PinholeCamera
+from scanweld.geometry.frame import Frame
+from scanweld.trajectory import Trajectory
+
+
+@dataclass(frozen=True, slots=True)
+class SelectedSequence:
+    """The frames of `base` at `indices`, in that order; timestamps and ground truth stay as they are."""
+
+    base: RgbdSequence
+    indices: range
+
+    @property
+    def name(self) -> str:
+        """Name of the whole sequence."""
+        return self.base.name
+
+    @property
+    def camera(self) -> PinholeCamera:
+        """Intrinsics of every frame."""
+        return self.base.camera
+
+    @property
+    def depth_scale(self) -> float:
+        """Units per metre of the stored depth."""
+        return self.base.depth_scale
+
+    @property
+    def ground_truth(self) -> Trajectory | None:
+        """Ground truth of the whole sequence."""
+        return self.base.ground_truth
+
+    @property
+    def timestamps_s(self) -> Float64:
+        """Time of the selected frames (N,) [s]."""
+        return self.base.timestamps_s[self.indices.start : self.indices.stop : self.indices.step]
+
+    def __len__(self) -> int:
+        return len(self.indices)
+
+    def read(self, index: int) -> Frame:
+        """Decode the selected frame `index`."""
+        return self.base.read(self.indices[index])
+
+    def __iter__(self) -> Iterator[Frame]:
+        return readable_frames(self)
+
+
+@dataclass(frozen=True, slots=True)
+class ResizedSequence:
+    """The frames of `base` with depth, colour and intrinsics resized by `scale`.
+
+    Raises
+    ------
+    InvalidInputError
+        When the scale is not within (0, 4].
+    """
+
+    base: RgbdSequence
+    scale: float
+
+    def __post_init__(self) -> None:
+        require_scale(self.scale)
+
+    @property
+    def name(self) -> str:
+        """Name of the full-size sequence."""
+        return self.base.name
+
+    @property
+    def camera(self) -> PinholeCamera:
+        """Intrinsics of the resized images."""
+        return self.base.camera.scaled(self.scale)
+
+    @property
+    def depth_scale(self) -> float:
+        """Units per metre of the stored depth."""
+        return self.base.depth_scale
+
+    @property
+    def ground_truth(self) -> Trajectory | None:
+        """Ground truth; it does not depend on the image size."""
+        return self.base.ground_truth
+
+    @property
+    def timestamps_s(self) -> Float64:
+        """Time of every frame (N,) [s]."""
+        return self.base.timestamps_s
+
+    def __len__(self) -> int:
+        return len(self.base)
+
+    def read(self, index: int) -> Frame:
+        """Decode and resize frame `index`."""
+        frame, camera = self.base.read(index), self.camera
+        color = None if frame.color is None else resize_color(frame.color, camera.shape)
+        return Frame(frame.timestamp_s, resize_depth(frame.depth_m, camera.shape), color, camera)
+
+    def __iter__(self) -> Iterator[Frame]:
+        return readable_frames(self)
+
+
+def select(sequence: RgbdSequence, frames: str | slice) -> RgbdSequence:
+    """Return the frames A:B[:STEP] of a sequence, by position as in Python; a missing end means to the end.
+
+    Raises
+    ------
+    InvalidInputError
+        When the text is no such range, the step is not positive, or no frame is left.
+    """
+    chosen = parse_frames(frames) if isinstance(frames, str) else frames
+    if chosen.step is not None and chosen.step < 1:
+        raise InvalidInputError(f"frames: the step must be at least 1, got {chosen.step}")
+    indices = range(*chosen.indices(len(sequence)))
+    if len(indices) == 0:
+        raise InvalidInputError(f"frames: {_text(chosen)} selects none of the {len(sequence)} frames")
+    return SelectedSequence(sequence, indices)
+
+
+def parse_frames(text: str) -> slice:
+    """Turn "A:B[:STEP]" into a slice; A and B may be left out.
+
+    Raises
+    ------
+    InvalidInputError
+        When the text is anything else.
+    """
+    parts = text.split(":")
+    try:
+        if len(parts) not in (2, 3):
+            raise ValueError
+        start, stop, step = (int(part) if part.strip() else None for part in (*parts, "")[:3])
+    except ValueError:
+        raise InvalidInputError(
+            f"frames: expected A:B or A:B:STEP, for example 0:200 or 100::2, got '{text}'"
+        ) from None
+    return slice(start, stop, step)
+
+
+def _text(chosen: slice) -> str:
+    start, stop = ("" if end is None else end for end in (chosen.start, chosen.stop))
+    return f"{start}:{stop}" + ("" if chosen.step is None else f":{chosen.step}")

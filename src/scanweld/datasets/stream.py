@@ -1,0 +1,84 @@
+"""Decode ahead of the consumer, on threads of its own, in order."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Generator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+
+from scanweld.datasets.base import RgbdSequence, no_readable_frame
+from scanweld.errors import InvalidInputError, UnreadableFrameError
+from scanweld.geometry.frame import Frame
+
+
+@dataclass(frozen=True, slots=True)
+class FrameRecord:
+    """One frame of the input, readable or not.
+
+    Attributes
+    ----------
+    index : position in the sequence, from 0
+    timestamp_s : [s]
+    frame : the frame, or None where it cannot be decoded
+    error : why it cannot, else ""
+    """
+
+    index: int
+    timestamp_s: float
+    frame: Frame | None
+    error: str = ""
+
+
+def stream(sequence: RgbdSequence, lookahead: int = 4, *, num_threads: int = 1) -> Generator[FrameRecord]:
+    """Yield a record for every frame, in order, while the next `lookahead` frames are being decoded.
+
+    Decoders release the GIL, so the consumer computes meanwhile. At most `lookahead` frames wait in memory.
+    Closing the generator, or leaving the loop by an exception, ends the threads after the frame in work.
+
+    Parameters
+    ----------
+    sequence : what to read
+    lookahead : frames decoded ahead, at least 1
+    num_threads : decoding threads, at least 1; the order does not depend on it
+
+    Raises
+    ------
+    InvalidInputError
+        When `lookahead` or `num_threads` is below 1.
+    DatasetError
+        At the end, when no frame at all could be decoded, and whatever else reading raises, at its frame.
+    """
+    if lookahead < 1 or num_threads < 1:
+        raise InvalidInputError(f"stream: expected at least one frame and thread, got {lookahead} and {num_threads}")
+    return _records(sequence, lookahead, num_threads)
+
+
+def _records(sequence: RgbdSequence, lookahead: int, num_threads: int) -> Generator[FrameRecord]:
+    timestamps_s = sequence.timestamps_s.tolist()
+
+    def record(index: int) -> FrameRecord:
+        try:
+            return FrameRecord(index, timestamps_s[index], sequence.read(index))
+        except UnreadableFrameError as error:
+            return FrameRecord(index, timestamps_s[index], None, str(error))
+
+    pending: deque[Future[FrameRecord]] = deque()
+    first_fault, num_read = "", 0
+    pool = ThreadPoolExecutor(max_workers=num_threads, thread_name_prefix="scanweld-decode")
+    try:
+        for index in range(len(timestamps_s)):
+            while len(pending) < lookahead and index + len(pending) < len(timestamps_s):
+                pending.append(pool.submit(record, index + len(pending)))
+            current = pending.popleft().result()
+            # The slot that has just become free is filled before the consumer starts to compute.
+            ahead = index + 1 + len(pending)
+            if ahead < len(timestamps_s):
+                pending.append(pool.submit(record, ahead))
+            num_read += current.frame is not None
+            first_fault = first_fault or current.error
+            yield current
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+    if num_read == 0:
+        raise no_readable_frame(sequence.name, len(timestamps_s), first_fault)

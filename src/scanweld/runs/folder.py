@@ -1,0 +1,77 @@
+"""A run folder appears complete or not at all."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+from scanweld.errors import OutputError
+
+
+def next_run_folder(name: str, root: Path = Path("runs")) -> Path:
+    """Return the first of `root`/`name`-1, -2, .. that does not exist."""
+    number = 1
+    while (root / f"{name}-{number}").exists():
+        number += 1
+    return root / f"{name}-{number}"
+
+
+def check_writable(folder: Path, *, force: bool) -> None:
+    """Raise OutputError before any work is done when `folder` could not be written at the end."""
+    if folder.exists() and not folder.is_dir():
+        raise OutputError(f"{folder}: exists and is a file; choose another --out")
+    if folder.is_dir() and any(folder.iterdir()):
+        if not force:
+            raise OutputError(f"{folder}: exists and is not empty; --force replaces it, --out writes elsewhere")
+        if not _looks_like_run(folder):
+            raise OutputError(f"{folder}: is not a run folder (no run.json), so --force will not replace it")
+    with _created_parent(folder), tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent):
+        pass
+
+
+@contextlib.contextmanager
+def write_folder(folder: Path, *, force: bool) -> Iterator[Path]:
+    """Yield an empty folder beside `folder`; at the end it takes its place, on an error it vanishes.
+
+    Raises
+    ------
+    OutputError
+        When the folder cannot be written, or exists and `force` is false.
+    """
+    check_writable(folder, force=force)
+    with _created_parent(folder):
+        aside = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+    try:
+        try:
+            yield aside
+        except OSError as error:
+            raise OutputError(f"{error.filename or folder}: cannot be written: {error.strerror or error}") from None
+        mask = os.umask(0)
+        os.umask(mask)
+        aside.chmod(0o777 & ~mask)  # temporary folders are private, results are not
+        if folder.exists():
+            old = aside.with_name(aside.name + ".old")
+            folder.rename(old)
+            aside.rename(folder)
+            shutil.rmtree(old)
+        else:
+            aside.rename(folder)
+    finally:
+        shutil.rmtree(aside, ignore_errors=True)
+
+
+@contextlib.contextmanager
+def _created_parent(folder: Path) -> Iterator[None]:
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        yield
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot be written: {error.strerror or error}; choose another --out") from None
+
+
+def _looks_like_run(folder: Path) -> bool:
+    return (folder / "run.json").is_file()

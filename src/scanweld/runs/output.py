@@ -1,0 +1,162 @@
+"""What a run folder holds."""
+
+from __future__ import annotations
+
+import csv
+import json
+import platform
+import time
+from collections.abc import Mapping, Sequence
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from scanweld.arrays import Float64
+from scanweld.config import to_toml
+from scanweld.datasets.base import RgbdSequence
+from scanweld.evaluation.trajectory_metrics import AteResult
+from scanweld.evaluation.trajectory_plot import plot_trajectory_error
+from scanweld.geometry.camera import PinholeCamera
+from scanweld.io.ply import write_ply
+from scanweld.io.trajectory_files import write_tum
+from scanweld.mapping.rendering import render_picture
+from scanweld.mapping.surfel_map import SurfelMap
+from scanweld.parallel import get_num_threads
+from scanweld.report.plots import plot_path, plot_tracking
+from scanweld.slam.motion import trajectory_of
+from scanweld.slam.system import Slam, SlamConfig
+from scanweld.trajectory import FrameResult, Trajectory
+
+RENDER_SIZE = (640, 480)
+PICTURE_CONFIDENCE = 2.0
+"""Surfels below this are left out of pictures."""
+
+STAGES = ("surfaces", "view", "track", "fuse", "loop")
+
+
+def write_run(
+    folder: Path,
+    slam: Slam,
+    sequence: RgbdSequence,
+    config: SlamConfig,
+    metrics: dict[str, Any],
+    error: AteResult | None,
+    *,
+    tracked_only: bool,
+    description: Mapping[str, Any],
+    started: float,
+) -> None:
+    """Write every file of a run into an empty folder; metrics["seconds_total"] is brought up to date."""
+    trajectory = slam.trajectory
+    (folder / "config.toml").write_text(to_toml(config), encoding="utf-8")
+    write_tum(folder / "trajectory.txt", trajectory_of(slam.results, tracked_only=tracked_only))
+    write_ply(folder / "map.ply", slam.map)
+    write_frames(folder / "frames.csv", slam.results)
+    write_renders(folder / "renders", slam.map, trajectory, sequence.camera)
+    plots = folder / "plots"
+    plots.mkdir()
+    plot_tracking(slam.results, plots / "tracking.png")
+    if error is not None:
+        plot_trajectory_error(error, plots / "trajectory.png", title=sequence.name)
+    else:
+        plot_path(trajectory.positions_m, plots / "trajectory.png", f"{sequence.name}: estimated path")
+    _write_json(folder / "run.json", {**_environment(config), **description})
+    metrics["seconds_total"] = time.perf_counter() - started
+    _write_json(folder / "metrics.json", metrics)
+
+
+def write_frames(path: Path, results: Sequence[FrameResult]) -> None:
+    """Write one line a frame: state, why, quality, time of each stage."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(
+            ["frame", "timestamp", "status", "alignment", "rmse", "loss", "inliers", "overlap", "surfels"]
+            + [f"ms_{stage}" for stage in STAGES]
+            + ["note"]
+        )
+        for r in results:
+            writer.writerow(
+                [r.index, repr(r.timestamp_s), r.state.value, r.status, f"{r.rmse_m:.9g}", f"{r.loss:.9g}"]
+                + [r.num_inliers, f"{r.overlap:.6f}", r.num_surfels]
+                + [f"{r.stage_ms.get(stage, 0.0):.3f}" for stage in STAGES]
+                + [r.note]
+            )
+
+
+def write_renders(folder: Path, surfels: SurfelMap, trajectory: Trajectory, camera: PinholeCamera) -> None:
+    """Draw the map in RGB and normals from three places of the path and from behind it all."""
+    folder.mkdir()
+    factor = min(1.0, RENDER_SIZE[0] / camera.width)
+    view_camera = camera.scaled(factor) if factor < 1 else camera
+    places = {
+        f"view-{k + 1}": trajectory.T_world_camera[round(s * (len(trajectory) - 1))]
+        for k, s in enumerate((0.1, 0.5, 0.9))
+    }
+    places["overview"] = overview_pose(surfels, trajectory)
+    # What was seen about once is mostly noise at edges; a run too short to confirm anything shows all it has.
+    least = PICTURE_CONFIDENCE if np.median(surfels.confidences) > 2 * PICTURE_CONFIDENCE else 0.0
+    for name, T_world_camera in places.items():
+        picture = render_picture(surfels, T_world_camera, view_camera, min_confidence=least)
+        for kind, image in (("rgb", picture.color), ("normals", picture.normal_colors(T_world_camera))):
+            _write_png(folder / f"{name}-{kind}.png", image)
+
+
+def overview_pose(surfels: SurfelMap, trajectory: Trajectory) -> Float64:
+    """Return a pose behind and above the cameras that has most of the map in view."""
+    poses = trajectory.T_world_camera
+    up = -poses[:, :3, 1].mean(axis=0)
+    up /= max(float(np.linalg.norm(up)), 1e-9)
+    points = surfels.positions_m[:, :: max(1, len(surfels) // 20_000)].T.astype(np.float64)
+    centre = np.median(points, axis=0)
+    size = float(np.percentile(np.linalg.norm(points - centre, axis=1), 90))
+    back = poses[:, :3, 3].mean(axis=0) - centre
+    back -= up * float(back @ up)
+    if np.linalg.norm(back) < 0.05 * size:  # the cameras turned about the middle of the map: any side will do
+        back = -poses[0, :3, 2]
+    back /= np.linalg.norm(back)
+    eye = centre + size * (1.7 * back + 1.1 * up)
+    return look_at(eye, centre, up)
+
+
+def look_at(eye_m: Float64, target_m: Float64, up: Float64) -> Float64:
+    """Return T_world_camera (4, 4) of a camera at `eye_m` that looks at `target_m`, y down along -`up`."""
+    forward = (target_m - eye_m) / np.linalg.norm(target_m - eye_m)
+    right = np.cross(forward, up)
+    if np.linalg.norm(right) < 1e-6:
+        right = np.cross(forward, np.roll(up, 1))
+    right /= np.linalg.norm(right)
+    T = np.eye(4)
+    T[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
+    T[:3, 3] = eye_m
+    return T
+
+
+def _write_png(path: Path, image: Any) -> None:
+    done, data = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_PNG_COMPRESSION, 3])
+    if not done:
+        raise OSError(f"{path}: the image cannot be encoded")
+    path.write_bytes(data.tobytes())
+
+
+def _write_json(path: Path, content: Mapping[str, Any]) -> None:
+    path.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+
+
+def _environment(config: SlamConfig) -> dict[str, Any]:
+    packages = {}
+    for name in ("numpy", "scipy", "numba", "opencv-python-headless"):
+        try:
+            packages[name] = version(name)
+        except PackageNotFoundError:
+            packages[name] = "unknown"
+    return {
+        "scanweld": version("scanweld"),
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        "packages": packages,
+        "seed": config.seed,
+        "threads": get_num_threads(),
+    }
