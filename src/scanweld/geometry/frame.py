@@ -33,6 +33,12 @@ class Frame:
             raise InvalidInputError(f"frame: depth_m must be float32 [m], got {self.depth_m.dtype}")
         if self.depth_m.shape != self.camera.shape:
             raise InvalidInputError(f"frame: depth has shape {self.depth_m.shape}, the camera {self.camera.shape}")
+        # Kernels test masks, never NaN. A NaN reaches both ends, so one comparison finds every kind.
+        low, high = float(self.depth_m.min()), float(self.depth_m.max())
+        if not (low >= 0 and high < np.inf):
+            raise InvalidInputError(
+                f"frame: depth_m must be finite and not negative, got {low} to {high} m; set invalid pixels to 0"
+            )
         if self.color is not None and (self.color.shape != (*self.camera.shape, 3) or self.color.dtype != np.uint8):
             raise InvalidInputError(
                 f"frame: color must be (H, W, 3) uint8 of the size of the depth {self.camera.shape}, "

@@ -108,7 +108,19 @@ def accumulate(rows, count, sums):
 
 @kernel
 def point_to_plane_sums(
-    start, stop, positions, normals, transform, target, intrinsics, width, height, gate, min_cosine, robust, partials
+    start,
+    stop,
+    positions,
+    normals,
+    transform,
+    target,
+    intrinsics,
+    width,
+    height,
+    gate,
+    min_cosine,
+    robust,
+    partials,
 ):
     """Sums of chunks start..stop into partials (chunks, SUMS) float64.
 

@@ -55,7 +55,10 @@ class ProjectiveConfig:
         0.5, "share of the compared points that agree with the depth in a trusted answer", low=0.0, high=1.0
     )
     max_conflict: float = setting(
-        0.3, "share of the compared points in front of the depth in a trusted answer", low=0.0, high=1.0
+        0.06,
+        "share of the compared points in front of the depth in a trusted answer; raise where things move",
+        low=0.0,
+        high=1.0,
     )
     step_m: float = setting(1e-4, "converged when a step moves the points less than this [m]", low=0.0)
 

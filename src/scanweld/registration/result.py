@@ -42,7 +42,8 @@ class FreeDirection:
     Attributes
     ----------
     words : what a person would call it, e.g. "translation along (0.00, 1.00, 0.00)"
-    vector : the unit twist; (6,) = (rho, phi) in 3-D, (3,) = (rho, phi) in 2-D, about the points' centroid
+    vector : the unit twist; (6,) = (rho, phi) in 3-D, (3,) = (rho, phi) in 2-D, about the points' centroid; zero for
+        a free "scale", which is no rigid motion
     """
 
     words: str
@@ -67,7 +68,7 @@ class RegistrationResult:
     information : (6, 6) in 3-D, (3, 3) in 2-D; Gauss-Newton Hessian of the metric that was minimised, translation [m]
         first, rotation [rad] second, left perturbation at the target's origin
     unobservable : directions that the data leaves free; they stay at the initial guess
-    note : one sentence for a person where the status is not CONVERGED, else ""
+    note : one sentence for a person: why the status is not CONVERGED, and what was dropped; "" where nothing is amiss
     history : the steps, where asked for
     """
 

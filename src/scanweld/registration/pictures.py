@@ -1,0 +1,179 @@
+"""Pictures of alignments: before and after, and every step of ICP. Matplotlib is loaded when one is drawn."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scanweld.arrays import Float64, Int64
+from scanweld.errors import OutputError
+from scanweld.geometry import se3
+from scanweld.geometry.point_cloud import PointCloud
+from scanweld.registration.explain import HornExplanation, IcpExplanation
+from scanweld.registration.result import RegistrationResult
+
+_SOURCE, _TARGET, _PAIR, _INK = "#d1495b", "#00798c", "#9aa5b1", "#22303c"
+_MOST_DRAWN = 30_000
+
+
+def draw_alignment(
+    path: str | os.PathLike[str], source: PointCloud, target: PointCloud, result: RegistrationResult
+) -> None:
+    """Draw source and target before and after the alignment, seen along their thinnest direction, as PNG.
+
+    Raises
+    ------
+    OutputError
+        When the file cannot be written.
+    """
+    moved = source.transformed(result.T_target_source, result.scale)
+    view = _View(target.points_m)
+    clouds = [view.flatten(_thinned(cloud.finite().points_m)) for cloud in (target, source, moved)]
+    titles = ("before", f"after: {result.status.value.replace('_', ' ')}, rmse {result.rmse_m:.3g} m")
+    figure, axes = _panels(titles, *_limits(np.concatenate(clouds)))
+    for axis, cloud in zip(axes, clouds[1:], strict=True):
+        points = np.concatenate([clouds[0], cloud])
+        colors = np.repeat([_TARGET, _SOURCE], [len(clouds[0]), len(cloud)])
+        mixed = np.random.default_rng(0).permutation(len(points))  # neither cloud hides the other
+        size = float(np.clip(40_000 / max(len(points), 1), 0.6, 36))
+        axis.scatter(*points[mixed].T, s=size, c=colors[mixed], alpha=0.8, linewidths=0, rasterized=True)
+        for label, color in (("target", _TARGET), ("source", _SOURCE)):
+            axis.scatter([], [], c=color, label=label)
+    _finish(path, figure, axes, view)
+
+
+def draw_horn(path: str | os.PathLike[str], explanation: HornExplanation) -> None:
+    """Draw the pairs before and after Horn's method as PNG; lines join partners."""
+    fit = explanation.fit
+    moved = fit.scale * explanation.source @ fit.rotation.T + fit.translation_m
+    view = _View(explanation.target)
+    places = view.flatten(np.concatenate([explanation.source, explanation.target, moved]))
+    figure, axes = _panels(("before", f"after Horn's method: E = {fit.error:.4g}"), *_limits(places))
+    rows = np.stack([np.arange(len(moved))] * 2, axis=1)
+    for axis, source in zip(axes, (explanation.source, moved), strict=True):
+        _draw_pairs(axis, view, source, explanation.target, rows)
+    _finish(path, figure, axes, view)
+
+
+def draw_icp(path: str | os.PathLike[str], explanation: IcpExplanation, most: int = 8) -> None:
+    """Draw the pairs of every step as PNG: the source moves, the target stays; the last panel is the end."""
+    result, view = explanation.result, _View(explanation.target)
+    extent = float(np.ptp(explanation.target, axis=0).max())
+    settled = bool(result.history) and result.history[-1].displacement_m <= 1e-9 * extent
+    steps = (result.history[:-1] if settled else result.history)[: most - 1]
+    moved = [
+        se3.transform_points(T, explanation.source) for T in (*(s.T_before for s in steps), result.T_target_source)
+    ]
+    rows = [np.stack([step.pairs.source, step.pairs.target], axis=1) for step in steps]
+    rows.append(explanation.steps[-1].pairs if explanation.steps else np.zeros((0, 2), np.int64))
+    titles = [f"step {k}: E = {step.fit.error:.4g}" for k, step in enumerate(steps, 1)]
+    titles.append(f"the end: {result.status.value.replace('_', ' ')}, rmse {result.rmse_m:.3g} m")
+    limits = _limits(view.flatten(np.concatenate([explanation.target, *moved])))
+    figure, axes = _panels(titles, *limits)
+    for axis, source, pairs in zip(axes, moved, rows, strict=True):
+        _draw_pairs(axis, view, source, explanation.target, pairs)
+    _finish(path, figure, axes, view)
+
+
+class _View:
+    """Looks at points along the direction in which they vary least."""
+
+    def __init__(self, points: Float64) -> None:
+        finite = points[np.isfinite(points).all(axis=1)]
+        self.center = finite.mean(axis=0) if len(finite) else np.zeros(points.shape[1])
+        self.plane = np.eye(points.shape[1])[:2]
+        self.labels = ("x [m]", "y [m]")
+        if points.shape[1] == 3 and len(finite) > 2:
+            spread = np.abs(np.linalg.eigh(np.cov(finite.T))[1][:, 0])
+            keep = [k for k in range(3) if k != int(spread.argmax())]  # along an axis: the ticks stay readable
+            self.plane = np.eye(3)[keep]
+            self.labels = (f"{'xyz'[keep[0]]} [m]", f"{'xyz'[keep[1]]} [m]")
+
+    def flatten(self, points: Float64) -> Float64:
+        return points @ self.plane.T
+
+
+def _thinned(points: Float64) -> Float64:
+    return points[:: max(1, len(points) // _MOST_DRAWN)]
+
+
+def _limits(points: Float64) -> tuple[Float64, Float64]:
+    """Corners of what is worth seeing: a few stray points do not shrink the rest."""
+    if len(points) == 0:
+        return np.zeros(2), np.ones(2)
+    share = 0.5 if len(points) > 1000 else 0.0
+    low, high = np.percentile(points, [share, 100 - share], axis=0)
+    margin = 0.12 * max(float((high - low).max()), 1e-12)
+    return low - margin, high + margin
+
+
+def _panels(titles: Sequence[str], low: Float64, high: Float64) -> tuple[Any, list[Any]]:
+    """Lay out one panel for each title, shaped like the view from corner `low` to corner `high`."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    count = len(titles)
+    columns = min(count, 4) if count != 5 else 3
+    rows = -(-count // columns)
+    width, height = 3.9 * (high - low) / max(high - low)
+    size = (max(width, 2.4) * columns + 0.7, max(height, 1.6) * rows + 0.6 * rows + 0.2)
+    figure = Figure(figsize=size, dpi=130, layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = list(figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True).flat)
+    for axis in axes[count:]:
+        axis.set_visible(False)
+    for axis, title in zip(axes, titles, strict=False):
+        axis.set_title(title, fontsize=10, color=_INK, loc="left")
+        axis.set_aspect("equal", adjustable="box")
+        axis.grid(color="#e6eaee", linewidth=0.8)
+        axis.set_axisbelow(True)
+        axis.tick_params(labelsize=8, colors=_INK, length=0)
+        for side in axis.spines.values():
+            side.set_visible(False)
+    axes[0].set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+    return figure, axes[:count]
+
+
+def _draw_pairs(axis: Any, view: _View, source: Float64, target: Float64, rows: Int64) -> None:
+    a, b = view.flatten(source), view.flatten(target)
+    for i, j in rows:
+        axis.plot(*np.stack([a[i], b[j]]).T, color=_PAIR, linewidth=1.2, zorder=1)
+    axis.scatter(*b.T, s=64, c=_TARGET, zorder=2, label="target")
+    axis.scatter(*a.T, s=64, c=_SOURCE, zorder=3, marker="D", label="source")
+    if len(a) + len(b) <= 40:
+        _name(axis, "a", a, _SOURCE, (5, -11))
+        _name(axis, "b", b, _TARGET, (5, 5))
+
+
+def _name(axis: Any, letter: str, points: Float64, color: str, offset: tuple[int, int]) -> None:
+    for number, point in enumerate(points, 1):
+        axis.annotate(
+            f"${letter}_{{{number}}}$",
+            point,
+            xytext=offset,
+            textcoords="offset points",
+            fontsize=9,
+            color=color,
+        )
+
+
+def _finish(path: str | os.PathLike[str], figure: Any, axes: Sequence[Any], view: _View) -> None:
+    for axis in axes:
+        axis.set_xlabel(view.labels[0], fontsize=8, color=_INK)
+    axes[0].set_ylabel(view.labels[1], fontsize=8, color=_INK)
+    legend = axes[0].legend(fontsize=8, frameon=False, loc="best", markerscale=1.0, labelcolor=_INK)
+    for handle in legend.legend_handles:
+        handle.set_sizes([36])
+        handle.set_alpha(1.0)
+    target = Path(path)
+    aside = target.with_name(f".{target.name}.tmp")
+    try:
+        figure.savefig(aside, format="png", facecolor="white")
+        aside.replace(target)
+    except OSError as error:
+        aside.unlink(missing_ok=True)
+        raise OutputError(f"{target}: cannot be written: {error.strerror or error}") from None

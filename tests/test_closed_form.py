@@ -1,0 +1,327 @@
+"""Closed form: the worked example by hand, properties, and every way in which pairs can fail to determine a motion."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from scanweld.errors import InvalidInputError
+from scanweld.geometry import se3
+from scanweld.registration.closed_form import align_closed_form, fit_horn
+from scanweld.registration.residuals import point_to_point
+from scanweld.registration.result import Status
+
+A = np.array([(0, 0), (1, 0), (0, 1), (1, 1), (2, 0.5)])
+B_NOISY = np.array([(2.10, 2.71), (3.01, 3.72), (1.24, 3.79), (1.79, 4.56), (3.04, 4.63)])
+C = np.sqrt(0.5)
+R_45 = np.array([[C, -C], [C, C]])
+B_EXACT = A @ R_45.T + [2, 3]
+
+
+def random_motion(rng: np.random.Generator, dimension: int) -> np.ndarray:
+    Q, upper = np.linalg.qr(rng.normal(size=(dimension, dimension)))
+    Q *= np.sign(np.diag(upper))
+    Q[:, 0] *= np.sign(np.linalg.det(Q))
+    T = np.eye(dimension + 1)
+    T[:dimension, :dimension], T[:dimension, dimension] = Q, rng.normal(size=dimension)
+    return T
+
+
+class TestWorkedExample:
+    """Horn's method, 2-D, five pairs. mean(a) = (4, 2.5) / 5 and sum|a'|^2 = (.64+.25) + (.04+.25) + (.64+.25) +
+    (.04+.25) + 1.44 = 3.8; sum a' a'^T = diag(2.8, 1), because sum x'y' = .4 - .1 - .4 + .1 + 0 = 0."""
+
+    def test_exact(self):
+        """b = R a + t: W = R diag(2.8, 1), so the singular values are 2.8 and 1, and E = 3.8 + 3.8 - 2 * 3.8 = 0."""
+        fit = fit_horn(A, B_EXACT)
+        np.testing.assert_allclose(fit.mean_source, [0.8, 0.5], atol=1e-15)
+        np.testing.assert_allclose(fit.mean_target, [2 + 0.3 * C, 3 + 1.3 * C], atol=1e-15)
+        np.testing.assert_allclose(fit.mean_target, [2.2121, 3.9192], atol=5e-5)
+        np.testing.assert_allclose(fit.W, R_45 * [2.8, 1], atol=1e-14)
+        np.testing.assert_allclose(fit.W, [[1.9799, -0.7071], [1.9799, 0.7071]], atol=5e-5)
+        np.testing.assert_allclose(fit.singular_values, [2.8, 1], atol=1e-14)
+        np.testing.assert_allclose(fit.rotation, R_45, atol=1e-15)
+        np.testing.assert_allclose(fit.translation_m, [2, 3], atol=1e-14)
+        assert fit.source_spread == pytest.approx(3.8)
+        assert fit.error == pytest.approx(0, abs=1e-28)
+        assert fit.rank == 2
+
+    def test_noisy(self):
+        """mean(b) = (11.18, 19.41) / 5; W_11 = sum x'_b x'_a = .1088 + .1548 + .7968 - .0892 + .9648 = 1.936 etc.
+
+        In the plane tan(angle) = (W_21 - W_12) / (W_11 + W_22) = 3.052 / 2.896, and the sum of the singular values
+        is sqrt(3.052^2 + 2.896^2) = 4.20732; det W = 3.95104 splits it into 2.7924 and 1.4149. E = 3.8 + 4.8824 -
+        2 * 4.20732 = 0.26777.
+        """
+        fit = fit_horn(A, B_NOISY)
+        np.testing.assert_allclose(fit.mean_target, [2.236, 3.882], atol=1e-12)
+        np.testing.assert_allclose(fit.W, [[1.936, -1.040], [2.012, 0.960]], atol=1e-12)
+        total = np.hypot(3.052, 2.896)
+        difference = np.sqrt(total**2 - 4 * 3.95104)
+        np.testing.assert_allclose(fit.singular_values, [(total + difference) / 2, (total - difference) / 2])
+        np.testing.assert_allclose(fit.singular_values, [2.7924, 1.4149], atol=5e-5)
+        c, s = 2.896 / total, 3.052 / total
+        np.testing.assert_allclose(fit.rotation, [[c, -s], [s, c]], atol=1e-12)
+        np.testing.assert_allclose(fit.rotation, [[0.6883, -0.7254], [0.7254, 0.6883]], atol=5e-5)
+        np.testing.assert_allclose(fit.translation_m, [2.048, 2.9575], atol=5e-5)
+        assert fit.error == pytest.approx(8.6824 - 2 * total, abs=1e-12)
+        assert fit.error == pytest.approx(0.26777, abs=5e-6)
+        result = align_closed_form(A, B_NOISY)
+        assert result.status is Status.CONVERGED
+        assert result.rmse_m == pytest.approx(np.sqrt(fit.error / 5))
+        np.testing.assert_array_equal(result.T_target_source, fit.transform)
+
+    @pytest.mark.parametrize("scale", ["symmetric", "least_squares"])
+    def test_scale_exact(self, scale):
+        """b = 2.7 R a + t: W is 2.7 times, sum|b'|^2 = 2.7^2 * 3.8 = 27.702, both scales are 2.7.
+
+        mean(b) = 2.7 R (0.8, 0.5) + t = (2 + 2.7 * 0.3 / sqrt 2, 3 + 2.7 * 1.3 / sqrt 2) = (2.5728, 5.4819).
+        """
+        B = 2.7 * A @ R_45.T + [2, 3]
+        fit = fit_horn(A, B, scale=scale)
+        np.testing.assert_allclose(fit.mean_target, [2 + 0.81 * C, 3 + 3.51 * C], atol=1e-14)
+        np.testing.assert_allclose(fit.W, [[5.3457, -1.9092], [5.3457, 1.9092]], atol=5e-5)
+        np.testing.assert_allclose(fit.singular_values, [7.56, 2.7])
+        assert fit.target_spread == pytest.approx(27.702)
+        assert fit.scale == pytest.approx(2.7)
+        np.testing.assert_allclose(fit.translation_m, [2, 3], atol=1e-13)
+
+    def test_the_two_scales_differ_with_noise(self):
+        """sqrt(4.8824 / 3.8) = 1.1335 and 4.20732 / 3.8 = 1.1072."""
+        scales = [align_closed_form(A, B_NOISY, scale=s).scale for s in ("symmetric", "least_squares", "none")]
+        np.testing.assert_allclose(scales, [np.sqrt(4.8824 / 3.8), np.hypot(3.052, 2.896) / 3.8, 1], atol=1e-12)
+        np.testing.assert_allclose(scales, [1.1335, 1.1072, 1], atol=5e-5)
+
+
+class TestRankDeficient:
+    def test_w_zero_gives_no_rotation(self):
+        """First ICP step of the worked example: all partners are b_1, W = 0, R = I, t = b_1 - mean(a)."""
+        fit = fit_horn(A, np.tile(B_NOISY[0], (5, 1)))
+        np.testing.assert_array_equal(fit.rotation, np.eye(2))
+        np.testing.assert_allclose(fit.translation_m, [1.30, 2.21], atol=1e-15)
+        assert fit.rank == 0
+        assert fit.free_planes == ((0, 1),)
+        result = align_closed_form(A, np.tile(B_NOISY[0], (5, 1)))
+        assert result.status is Status.DEGENERATE
+        assert [d.words for d in result.unobservable] == ["rotation"]
+
+    @pytest.mark.parametrize("method", ["svd", "quaternion"])
+    def test_a_line_turns_no_more_than_it_must(self, method):
+        """A line along x becomes one along y: the smallest rotation is 90 degrees about z, the turn about y is free."""
+        s = np.linspace(-1, 1, 7)[:, None]
+        result = align_closed_form(s * [1, 0, 0], s * [0, 1, 0] + [5, 6, 7], method=method)
+        expected = [[0, -1, 0, 5], [1, 0, 0, 6], [0, 0, 1, 7], [0, 0, 0, 1]]
+        np.testing.assert_allclose(result.T_target_source, expected, atol=1e-12)
+        assert result.status is Status.DEGENERATE
+        assert [d.words for d in result.unobservable] == ["rotation about (0.00, 1.00, 0.00)"]
+        np.testing.assert_allclose(np.abs(result.unobservable[0].vector), [0, 0, 0, 0, 1, 0], atol=1e-12)
+
+    @pytest.mark.parametrize("method", ["svd", "quaternion"])
+    def test_a_noisy_line_is_still_a_line(self, method):
+        """The turn about the line is decided by noise alone: it is named, not invented."""
+        rng = np.random.default_rng(0)
+        s = rng.uniform(-1, 1, (200, 1))
+        a, b = (s * [1, 0, 0] + 0.01 * rng.normal(size=(200, 3)) for _ in range(2))
+        result = align_closed_form(a, b, method=method)
+        assert result.status is Status.DEGENERATE
+        assert [d.words for d in result.unobservable] == ["rotation about (1.00, 0.00, 0.00)"]
+        assert np.degrees(se3.rotation_angle_rad(result.T_target_source)) < 1
+
+    @pytest.mark.parametrize("method", ["svd", "quaternion"])
+    def test_one_place(self, method):
+        result = align_closed_form(np.ones((10, 3)), np.full((10, 3), 4.0), method=method)
+        assert result.status is Status.DEGENERATE
+        assert len(result.unobservable) == 3
+        np.testing.assert_allclose(result.T_target_source, [[1, 0, 0, 3], [0, 1, 0, 3], [0, 0, 1, 3], [0, 0, 0, 1]])
+
+    def test_a_plane_determines_the_rotation(self):
+        rng = np.random.default_rng(0)
+        a = rng.normal(size=(20, 3)) * [1, 1, 0]
+        T = random_motion(rng, 3)
+        result = align_closed_form(a, se3.transform_points(T, a))
+        assert result.status is Status.CONVERGED
+        np.testing.assert_allclose(result.T_target_source, T, atol=1e-13)
+
+    @pytest.mark.parametrize("scale", ["symmetric", "least_squares"])
+    def test_no_extent_has_no_scale(self, scale):
+        for a, b in ((np.ones((5, 3)), np.random.default_rng(0).normal(size=(5, 3))), (np.eye(3), np.ones((3, 3)))):
+            result = align_closed_form(a, b, scale=scale)
+            assert result.status is Status.DEGENERATE
+            assert result.scale == 1
+            assert "scale" in [d.words for d in result.unobservable]
+            assert np.isfinite(result.T_target_source).all()
+
+    def test_unrelated_pairs_determine_nothing(self):
+        rng = np.random.default_rng(0)
+        result = align_closed_form(rng.normal(size=(300, 3)), rng.normal(size=(300, 3)))
+        assert result.status is Status.DEGENERATE
+
+
+class TestMirrored:
+    @pytest.mark.parametrize("method", ["svd", "quaternion"])
+    @pytest.mark.parametrize("stretch", [(1, 1, 1), (3, 2, 1)])
+    def test_a_reflection_is_never_returned_nor_trusted(self, method, stretch):
+        a = np.random.default_rng(0).normal(size=(100, 3)) * stretch
+        result = align_closed_form(a, a * [1, 1, -1], method=method)
+        assert np.linalg.det(result.T_target_source[:3, :3]) == pytest.approx(1)
+        assert result.status is Status.DEGENERATE
+        assert "mirrored" in result.note
+
+    def test_noisy_planes_keep_a_proper_rotation_and_scale_one(self):
+        """Golden case 2: on near-planar pairs noise makes U V^T a reflection about half of the time."""
+        reflections = 0
+        for seed in range(40):
+            rng = np.random.default_rng(seed)
+            a = rng.normal(size=(30, 3)) * [1, 1, 1e-3]
+            T = random_motion(rng, 3)
+            b = se3.transform_points(T, a) + 0.01 * rng.normal(size=a.shape)
+            fit = fit_horn(a, b)
+            reflections += np.linalg.det(fit.U @ fit.Vt) < 0
+            result = align_closed_form(a, b)
+            assert np.linalg.det(result.T_target_source[:3, :3]) == pytest.approx(1)
+            assert result.scale == 1
+            assert result.status is Status.CONVERGED
+            assert np.degrees(se3.rotation_angle_rad(result.T_target_source @ se3.inverse(T))) < 2
+        assert reflections > 5
+
+
+@given(st.integers(0, 10**6), st.integers(2, 6), st.floats(0.2, 5))
+def test_the_motion_comes_back_in_any_dimension(seed, dimension, scale):
+    rng = np.random.default_rng(seed)
+    a = rng.normal(size=(dimension + 5, dimension))
+    T = random_motion(rng, dimension)
+    b = scale * a @ T[:-1, :-1].T + T[:-1, -1]
+    for kind in ("symmetric", "least_squares"):
+        result = align_closed_form(a, b, scale=kind)
+        assert result.status is Status.CONVERGED
+        np.testing.assert_allclose(result.T_target_source, T, atol=1e-10)
+        assert result.scale == pytest.approx(scale)
+
+
+@given(st.integers(0, 10**6), st.floats(0, 0.3))
+def test_svd_and_quaternion_agree(seed, noise):
+    rng = np.random.default_rng(seed)
+    a = rng.normal(size=(12, 3))
+    b = se3.transform_points(random_motion(rng, 3), a) + noise * rng.normal(size=a.shape)
+    w = rng.uniform(0.1, 3, 12)
+    one, other = (align_closed_form(a, b, weights=w, method=m, scale="symmetric") for m in ("svd", "quaternion"))
+    np.testing.assert_allclose(one.T_target_source, other.T_target_source, atol=1e-11)
+    assert one.status is other.status
+
+
+@given(st.integers(0, 10**6))
+def test_nothing_nearby_is_better(seed):
+    """The optimum: no small rotation or translation lowers E."""
+    rng = np.random.default_rng(seed)
+    a, w = rng.normal(size=(15, 3)), rng.uniform(0.1, 2, 15)
+    b = se3.transform_points(random_motion(rng, 3), a) + 0.2 * rng.normal(size=a.shape)
+    result = align_closed_form(a, b, weights=w)
+
+    def error(T):
+        return w @ ((b - se3.transform_points(T, a)) ** 2).sum(axis=1)
+
+    best = error(result.T_target_source)
+    assert result.rmse_m == pytest.approx(np.sqrt(best / w.sum()))
+    for xi in 1e-3 * rng.normal(size=(20, 6)):
+        assert error(se3.exp(xi) @ result.T_target_source) >= best - 1e-12
+
+
+@given(st.integers(0, 10**6))
+def test_moving_both_sets_moves_the_answer(seed):
+    rng = np.random.default_rng(seed)
+    a = rng.normal(size=(10, 3))
+    b = se3.transform_points(random_motion(rng, 3), a) + 0.05 * rng.normal(size=a.shape)
+    F, G = random_motion(rng, 3), random_motion(rng, 3)
+    moved = align_closed_form(se3.transform_points(F, a), se3.transform_points(G, b)).T_target_source
+    np.testing.assert_allclose(moved, G @ align_closed_form(a, b).T_target_source @ se3.inverse(F), atol=1e-10)
+
+
+def test_weights_count_pairs():
+    """A weight of 3 is the pair three times, a weight of 0 is no pair."""
+    rng = np.random.default_rng(0)
+    a, b = rng.normal(size=(2, 8, 3))
+    b = a + 0.1 * b
+    w = np.array([3, 0, 1, 2, 1, 1, 0, 1])
+    one = align_closed_form(a, b, weights=w)
+    other = align_closed_form(np.repeat(a, w, axis=0), np.repeat(b, w, axis=0))
+    np.testing.assert_allclose(one.T_target_source, other.T_target_source, atol=1e-14)
+    np.testing.assert_allclose(one.information, other.information)
+    assert one.num_inliers == 6
+
+
+def test_information_is_that_of_the_rows():
+    rng = np.random.default_rng(0)
+    a, b = rng.normal(size=(2, 9, 3))
+    result = align_closed_form(a, a + 0.01 * b)
+    _, jacobian = point_to_point(se3.transform_points(result.T_target_source, a), b)
+    rows = jacobian.reshape(-1, 6)
+    np.testing.assert_allclose(result.information, rows.T @ rows, atol=1e-12)
+
+
+@pytest.mark.parametrize(("unit", "offset"), [(1, 1e6), (1e-6, 0), (1e-6, 1e-3), (1e6, 0)])
+def test_far_and_tiny_sets_lose_nothing(unit, offset):
+    rng = np.random.default_rng(0)
+    a = rng.normal(size=(50, 3))
+    R = random_motion(rng, 3)[:3, :3]
+    result = align_closed_form(unit * a + offset, unit * a @ R.T - offset)
+    assert result.status is Status.CONVERGED
+    np.testing.assert_allclose(result.T_target_source[:3, :3], R, atol=1e-9)
+    assert result.rmse_m < 1e-9 * unit + 1e-15 * offset * 10
+
+
+def test_pairs_that_are_not_finite_are_dropped_and_counted():
+    a, b = A.copy(), B_EXACT.copy()
+    a = np.vstack([a, [np.nan, 0], [1, 1]])
+    b = np.vstack([b, [0, 0], [np.inf, 1]])
+    result = align_closed_form(a, b)
+    np.testing.assert_allclose(result.T_target_source[:2, :2], R_45, atol=1e-14)
+    assert result.note == "2 pairs were not finite and were dropped"
+    assert result.overlap == pytest.approx(5 / 7)
+
+
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_too_few_pairs(count):
+    result = align_closed_form(np.eye(3)[:count], np.eye(3)[:count] + 1)
+    assert result.status is Status.TOO_FEW_CORRESPONDENCES
+    assert result.note
+    assert np.isfinite(result.T_target_source).all()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ((A, B_NOISY[:4]), "equal lengths"),
+        ((A, np.ones((5, 3))), r"shape \(N, 2\)"),
+        ((A.T, A.T), None),
+        ((np.ones(5), np.ones(5)), "shape"),
+        ((A.astype(str), A), "numbers"),
+    ],
+)
+def test_wrong_shapes_raise(arguments, words):
+    if words is None:  # (2, 5) is two points of a five-dimensional space
+        assert align_closed_form(*arguments).status is Status.TOO_FEW_CORRESPONDENCES
+        return
+    with pytest.raises(InvalidInputError, match=words):
+        align_closed_form(*arguments)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"weights": [1, 1]}, {"weights": [-1, 1, 1, 1, 1]}, {"weights": [np.nan, 1, 1, 1, 1]},
+        {"scale": "both"}, {"method": "guess"}, {"method": "quaternion"},
+    ],
+)  # fmt: skip
+def test_wrong_options_raise(options):
+    with pytest.raises(InvalidInputError, match=next(iter(options))):
+        align_closed_form(A, B_NOISY, **options)
+
+
+def test_integers_are_points_and_arguments_stay_as_they_are():
+    a = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    keep = a.copy()
+    result = align_closed_form(a, a + 2)
+    np.testing.assert_allclose(result.T_target_source[:3, 3], 2)
+    np.testing.assert_array_equal(a, keep)
