@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 import os
+import shutil
 import sys
 from collections.abc import Sequence
 from typing import Annotated
@@ -20,11 +21,15 @@ from scanweld.cli.render import render
 from scanweld.cli.slam import slam
 from scanweld.errors import ScanweldError
 
+PANEL_COLUMNS = 80
+"""On a narrower terminal the help is plain: its panels would cut the names of options short."""
+
 app = typer.Typer(
     name="scanweld",
     help="Register point sets and build dense 3-D maps from RGB-D video.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
+    rich_markup_mode="rich" if shutil.get_terminal_size().columns >= PANEL_COLUMNS else None,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 for command in (demo, slam, register, evaluate, render):

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+import numpy.typing as npt
 
-from scanweld.arrays import Float32
+from scanweld.arrays import Array, Float32
 from scanweld.config import check_ranges, setting
 from scanweld.errors import InvalidInputError
 from scanweld.geometry import kernels
@@ -23,6 +24,9 @@ class SurfaceConfig:
     noise_floor_m: float = setting(0.0012, "depth noise at noise_nearest_m [m]; raise for a worse sensor", low=1e-6)
     noise_growth: float = setting(0.0019, "growth of the noise with the square of the depth [1/m]", low=0.0)
     noise_nearest_m: float = setting(0.4, "depth of the least noise [m]", low=0.0)
+    max_noise_scale: float = setting(
+        8.0, "the noise is scaled by what each image shows, from 1 to this; 1 trusts the numbers above", low=1.0
+    )
     normal_radius: int = setting(
         2, "window radius of the normals [pixels]; raise for noise, lower for detail", low=1, high=8
     )
@@ -35,7 +39,7 @@ class SurfaceConfig:
 
     @property
     def noise(self) -> Float32:
-        """sigma(z) = n[0] + n[1] (z - n[2])^2, axial noise of Nguyen et al. 2012 (eq. 5)."""
+        """sigma(z) = n[0] + n[1] (z - n[2])^2, axial noise of Nguyen et al. 2012 (eq. 5), before it is scaled."""
         return np.array([self.noise_floor_m, self.noise_growth, self.noise_nearest_m], np.float32)
 
 
@@ -80,6 +84,8 @@ def build_pyramid(frame: Frame, config: SurfaceConfig | None = None) -> SurfaceP
     depth = frame.depth_m
     if float(depth.max(initial=0.0)) > config.max_depth_m:
         depth = np.where(depth > config.max_depth_m, np.float32(0), depth)
+    scale = noise_scale(depth, config)
+    config = replace(config, noise_floor_m=config.noise_floor_m * scale, noise_growth=config.noise_growth * scale)
     camera = frame.camera
     levels = []
     for level in range(config.levels):
@@ -93,11 +99,30 @@ def build_pyramid(frame: Frame, config: SurfaceConfig | None = None) -> SurfaceP
     return SurfacePyramid(frame, tuple(levels))
 
 
+def noise_scale(depth_m: Float32, config: SurfaceConfig) -> float:
+    """Estimate how much noisier an image is than the configured model, from 1 to `max_noise_scale`.
+
+    Inverse depth is linear along rows and columns of a plane, so the bends between three pixels three apart are noise
+    almost everywhere; their median is compared with the model's (median absolute deviation).
+    """
+    ratios = []
+    for image in (depth_m[::8], depth_m.T[::8]):
+        before, centre, behind = image[:, :-6:4], image[:, 3:-3:4], image[:, 6::4]
+        valid = (before > 0) & (centre > 0) & (behind > 0)
+        a, z, b = before[valid], centre[valid], behind[valid]
+        sigma = config.noise_floor_m + config.noise_growth * (z - config.noise_nearest_m) ** 2
+        ratios.append(np.abs(1 / a + 1 / b - 2 / z) * z * z / (np.sqrt(np.float32(6)) * sigma))
+    together = np.concatenate(ratios)
+    if len(together) < 100:
+        return 1.0
+    return float(np.clip(1.4826 * np.median(together), 1.0, config.max_noise_scale))
+
+
 def surface_image(depth_m: Float32, camera: PinholeCamera, config: SurfaceConfig) -> Float32:
     """Return the surface image (H, W, 8) of a depth image; see :class:`SurfaceLevel`."""
     if depth_m.shape != camera.shape:
         raise InvalidInputError(f"depth has shape {depth_m.shape}, the camera {camera.shape}")
-    depth = np.ascontiguousarray(depth_m, dtype=np.float32)
+    depth = as_kernel_input(depth_m, np.float32)
     surface = np.empty((*depth.shape, 8), np.float32)
     intrinsics = intrinsics_array(camera)
     noise, radius, cosine = config.noise, config.normal_radius, np.float32(config.min_cosine)
@@ -114,7 +139,7 @@ def half_size(depth_m: Float32, camera: PinholeCamera, relative_band: float = 0.
 
     Returns the image (H // 2, W // 2) and its camera, whose pixel centres lie between four of the old ones.
     """
-    depth = np.ascontiguousarray(depth_m, dtype=np.float32)
+    depth = as_kernel_input(depth_m, np.float32)
     half = np.empty((depth.shape[0] // 2, depth.shape[1] // 2), np.float32)
     band = np.float32(relative_band)
     run_ranges(half.shape[0], lambda start, stop: kernels.halve_depth(start, stop, depth, band, half))
@@ -134,7 +159,7 @@ def bilateral_filter(
 ) -> Float32:
     """Smooth depth (H, W) [m] where neighbours agree within the noise (Tomasi and Manduchi 1998)."""
     config = config or SurfaceConfig()
-    depth = np.ascontiguousarray(depth_m, dtype=np.float32)
+    depth = as_kernel_input(depth_m, np.float32)
     smooth = np.empty_like(depth)
     noise, sigma, factor = config.noise, np.float32(space_sigma), np.float32(3)
 
@@ -143,6 +168,14 @@ def bilateral_filter(
 
     run_ranges(depth.shape[0], rows)
     return smooth
+
+
+def as_kernel_input(image: Array, dtype: npt.DTypeLike) -> Array:
+    """Return an image as a contiguous, writeable array, copied only if need be.
+
+    Kernels are compiled for one layout; a view of a BGR image or a read-only buffer would compile them anew.
+    """
+    return np.require(image, dtype, ("C", "W"))
 
 
 def intrinsics_array(camera: PinholeCamera) -> Float32:

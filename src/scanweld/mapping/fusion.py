@@ -10,7 +10,7 @@ import numpy as np
 from scanweld.arrays import Float32, Float64
 from scanweld.config import check_ranges, setting
 from scanweld.geometry.camera import PinholeCamera
-from scanweld.geometry.depth import SurfacePyramid
+from scanweld.geometry.depth import SurfacePyramid, as_kernel_input, intrinsics_array
 from scanweld.mapping import kernels
 from scanweld.mapping.rendering import Candidates, render_index_map
 from scanweld.mapping.surfel_map import SurfelMap
@@ -30,7 +30,10 @@ class FusionConfig:
         0.005, "and always within this [m]; raise for a wrong camera model, lower for fine detail", low=0.0
     )
     min_cosine: float = setting(0.5, "merged normals agree at least this well; lower for noise", low=-1.0, high=1.0)
-    stable_confidence: float = setting(5.0, "a surfel of this confidence is stable; raise for clutter", low=0.0)
+    spread_pixels: float = setting(
+        1.0, "a surfel this near a pixel's centre covers it [pixels]; raise for a smaller map", low=0.5, high=1.5
+    )
+    stable_confidence: float = setting(3.0, "a surfel of this confidence is stable; raise for clutter", low=0.0)
     unstable_frames: int = setting(
         40,
         "a surfel still unstable after this many frames is removed; raise to keep what is seen briefly",
@@ -82,18 +85,30 @@ def fuse(
     color = pyramid.frame.color
     if color is None:
         color = np.full((*camera.shape, 3), 160, np.uint8)
+    color = as_kernel_input(color, np.uint8)
     alpha, most = radial_weight(camera), np.float32(config.max_confidence)
-    transform = T_world_camera[:3].astype(np.float32)
+    transform, intrinsics = T_world_camera[:3].astype(np.float32), intrinsics_array(camera)
     parameters = np.array(
-        [config.gate_sigma, config.gate_floor_m, config.min_cosine, config.free_space_margin_m], np.float32
+        [config.gate_sigma, config.gate_floor_m, config.min_cosine, config.free_space_margin_m, config.spread_pixels],
+        np.float32,
     )
-    index_map, _ = render_index_map(surfels, candidates, T_world_camera, camera)
+    index_map, _ = render_index_map(surfels, candidates, T_world_camera, camera, config.stable_confidence)
     action, row_counts = np.empty(camera.shape, np.uint8), np.empty(camera.height, np.int64)
     a = surfels.arrays
 
     def associate(start: int, stop: int) -> None:
         kernels.associate_rows(
-            start, stop, index_map, surface, transform, parameters, a.positions, a.normals, row_counts, action
+            start,
+            stop,
+            index_map,
+            surface,
+            transform,
+            intrinsics,
+            parameters,
+            a.positions,
+            a.normals,
+            row_counts,
+            action,
         )
 
     def merge(start: int, stop: int) -> None:

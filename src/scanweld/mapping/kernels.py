@@ -44,11 +44,12 @@ def cull(start, stop, positions, count, transform, intrinsics, width, height, ma
 
 
 @kernel
-def splat(start, stop, positions, normals, ids, counts, transform, intrinsics, min_cosine, buffer):
+def splat(start, stop, positions, normals, confidences, ids, counts, transform, intrinsics, stable, buffer):
     """Put the listed surfels of chunks start..stop into a depth buffer (H, W) int64, one pixel each, nearest wins.
 
-    A key is the depth in micrometres and the surfel's number, so ties have one winner. Surfels that are seen from
-    behind or more flatly than `min_cosine` are left out.
+    A key is the depth in micrometres and the surfel's number, so ties have one winner. A surfel below the `stable`
+    confidence counts as further away by two percent, about three standard deviations of the depth noise: a speck does
+    not hide the surface it belongs to. Surfels seen from behind or nearly edge-on are left out.
     """
     height, width = buffer.shape
     fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
@@ -69,8 +70,10 @@ def splat(start, stop, positions, normals, ids, counts, transform, intrinsics, m
             ny = transform[1, 0] * a + transform[1, 1] * b + transform[1, 2] * c
             nz = transform[2, 0] * a + transform[2, 1] * b + transform[2, 2] * c
             facing = -(nx * xc + ny * yc + nz * zc)
-            if facing < min_cosine * np.sqrt(xc * xc + yc * yc + zc * zc):
+            if facing < np.float32(0.1) * np.sqrt(xc * xc + yc * yc + zc * zc):
                 continue
+            if confidences[i] < stable:
+                zc *= np.float32(1.02)
             key = (np.int64(zc * np.float32(1e6)) << np.int64(32)) | np.int64(i)
             row, column = np.int64(v), np.int64(u)
             if key < buffer[row, column]:
@@ -122,8 +125,8 @@ APPEND, MERGE, SEEN_THROUGH = np.uint8(1), np.uint8(2), np.uint8(4)
 
 
 @kernel
-def covers(i, qx, qy, qz, nx, ny, nz, gate, reach, min_cosine, positions, normals):
-    """Whether surfel i lies in the tangent plane of q within `gate`, no further than `reach`, and faces as n does."""
+def agrees(i, qx, qy, qz, nx, ny, nz, gate, reach, min_cosine, positions, normals):
+    """Whether surfel i is within `gate` of q along the normal n, within `reach` of it in all, and faces as n does."""
     dx, dy, dz = positions[0, i] - qx, positions[1, i] - qy, positions[2, i] - qz
     along = abs(nx * dx + ny * dy + nz * dz)
     cosine = nx * normals[0, i] + ny * normals[1, i] + nz * normals[2, i]
@@ -132,16 +135,17 @@ def covers(i, qx, qy, qz, nx, ny, nz, gate, reach, min_cosine, positions, normal
 
 @kernel
 def associate_rows(
-    start, stop, index_map, surface, transform, parameters, positions, normals, row_counts, action
+    start, stop, index_map, surface, transform, intrinsics, parameters, positions, normals, row_counts, action
 ):  # fmt: skip
     """Decide for the pixels of rows start..stop what they do to the map; the map is only read.
 
-    surface (H, W, 8), see `SurfaceLevel.surface`; transform (3, 4) camera -> world; parameters (4,): gate in standard
-    deviations, gate floor [m], least cosine of agreeing normals, free-space margin [m]; row_counts (H,): new surfels;
+    surface (H, W, 8), see `SurfaceLevel.surface`; transform (3, 4) camera -> world; parameters (5,): gate in standard
+    deviations, gate floor [m], least cosine of agreeing normals, free-space margin [m], spread [pixels]; row_counts (H,): new surfels;
     action (H, W) uint8: MERGE with the pixel's own surfel, APPEND a new one, the own surfel is SEEN_THROUGH.
     """
     height, width = index_map.shape
     sigmas, floor, min_cosine, margin = parameters[0], parameters[1], parameters[2], parameters[3]
+    spread = parameters[4]
     for v in range(start, stop):
         new = 0
         for u in range(width):
@@ -158,18 +162,29 @@ def associate_rows(
             ny = transform[1, 0] * a + transform[1, 1] * b + transform[1, 2] * c
             nz = transform[2, 0] * a + transform[2, 1] * b + transform[2, 2] * c
             gate = max(sigmas / s[6], floor)
-            # Two pixels wide: a surfel in a neighbouring pixel covers this one as well.
             reach = np.float32(4) * s[7] + gate
             i = index_map[v, u]
-            if i >= 0 and covers(i, qx, qy, qz, nx, ny, nz, gate, reach, min_cosine, positions, normals):
+            if i >= 0 and agrees(i, qx, qy, qz, nx, ny, nz, gate, reach, min_cosine, positions, normals):
                 action[v, u] = MERGE
                 continue
+            # A surfel that landed in a neighbouring pixel may still be near enough to this one's centre.
             covered = False
             for dv in range(max(-1, -v), min(1, height - 1 - v) + 1):
                 for du in range(max(-1, -u), min(1, width - 1 - u) + 1):
                     j = index_map[v + dv, u + du]
-                    if j >= 0 and not covered:
-                        covered = covers(j, qx, qy, qz, nx, ny, nz, gate, reach, min_cosine, positions, normals)
+                    if covered or j < 0 or j == i:
+                        continue
+                    dx, dy, dz = (
+                        positions[0, j] - transform[0, 3], positions[1, j] - transform[1, 3],
+                        positions[2, j] - transform[2, 3],
+                    )  # fmt: skip
+                    xc = transform[0, 0] * dx + transform[1, 0] * dy + transform[2, 0] * dz
+                    yc = transform[0, 1] * dx + transform[1, 1] * dy + transform[2, 1] * dz
+                    zc = transform[0, 2] * dx + transform[1, 2] * dy + transform[2, 2] * dz
+                    right = intrinsics[0] * xc / zc + intrinsics[2] - np.float32(u)
+                    down = intrinsics[1] * yc / zc + intrinsics[3] - np.float32(v)
+                    near = right * right + down * down < spread * spread
+                    covered = near and agrees(j, qx, qy, qz, nx, ny, nz, gate, reach, min_cosine, positions, normals)
             if not covered:
                 action[v, u] = APPEND
                 new += 1
@@ -205,7 +220,8 @@ def merge_rows(
         for u in range(index_map.shape[1]):
             i, more = index_map[v, u], alpha[v, u]
             if action[v, u] & SEEN_THROUGH:
-                confidences[i] -= more
+                # Never below zero: a surfel that is confirmed after all takes the new measurement's place.
+                confidences[i] = max(confidences[i] - more, np.float32(0))
             if (action[v, u] & MERGE) == 0:
                 continue
             s = surface[v, u]

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from scanweld.arrays import Float64
+from scanweld.geometry import se3
 from scanweld.geometry.camera import PinholeCamera
 from scanweld.geometry.depth import SurfacePyramid
 from scanweld.geometry.views import MapCorrection, ModelView
 from scanweld.mapping.fusion import FusionConfig, FusionCounts, fuse
-from scanweld.mapping.rendering import Candidates, find_candidates, render_model_view
+from scanweld.mapping.rendering import VIEW_MARGIN_PIXELS, Candidates, find_candidates, render_model_view
 from scanweld.mapping.surfel_map import SurfelMap
 
 
@@ -23,17 +26,19 @@ class SurfelMapper:
         self.map = SurfelMap()
         self._frames_fused = 0
         self._candidates: Candidates | None = None
+        self._viewed_from: tuple[Float64, PinholeCamera] | None = None
 
     def view(self, T_world_camera: Float64, camera: PinholeCamera) -> ModelView:
         """Return the map as a camera at `T_world_camera` sees it."""
         self._candidates = find_candidates(self.map, T_world_camera, camera)
-        return render_model_view(self.map, self._candidates, T_world_camera, camera)
+        self._viewed_from = T_world_camera, camera
+        return render_model_view(self.map, self._candidates, T_world_camera, camera, self.config.stable_confidence)
 
     def fuse(self, pyramid: SurfacePyramid, T_world_camera: Float64) -> FusionCounts:
         """Merge a frame seen from `T_world_camera` into the map."""
-        candidates = self._candidates
-        if candidates is None:
-            candidates = find_candidates(self.map, T_world_camera, pyramid.levels[0].camera)
+        camera, candidates = pyramid.levels[0].camera, self._candidates
+        if candidates is None or not self._near_the_view(T_world_camera, camera):
+            candidates = find_candidates(self.map, T_world_camera, camera)
         counts = fuse(self.map, candidates, pyramid, T_world_camera, self._frames_fused, self.config)
         self._frames_fused += 1
         self._candidates = None
@@ -43,3 +48,16 @@ class SurfelMapper:
         """Move surfels with their keyframes."""
         self.map.apply_correction(correction)
         self._candidates = None
+
+    def _near_the_view(self, T_world_camera: Float64, camera: PinholeCamera) -> bool:
+        """Whether what is seen from here lies within the margin of the last view."""
+        if self._viewed_from is None or self._viewed_from[1] != camera:
+            return False
+        motion = se3.inverse(self._viewed_from[0]) @ T_world_camera
+        shift, turn = float(np.linalg.norm(motion[:3, 3])), float(se3.rotation_angle_rad(motion))
+        # At the corners of the image a turn moves pixels by half as much again as in the middle.
+        return max(camera.fx, camera.fy) * (1.5 * turn + shift / NEAREST_M) < VIEW_MARGIN_PIXELS
+
+
+NEAREST_M = 0.3
+"""Surfaces nearer than this are not expected when a view is used again."""

@@ -15,6 +15,12 @@ from scanweld.mapping import kernels
 from scanweld.mapping.surfel_map import SurfelMap
 from scanweld.parallel import get_num_threads, run_ranges, split_range
 
+FARTHEST_M = 2000.0
+"""Micrometres up to here fit the depth buffer's keys."""
+
+VIEW_MARGIN_PIXELS = 64.0
+"""Surfels this far outside the image are kept for a camera that moves a little."""
+
 
 @dataclass(frozen=True, slots=True)
 class Candidates:
@@ -32,8 +38,8 @@ def find_candidates(
     T_world_camera: Float64,
     camera: PinholeCamera,
     *,
-    margin_pixels: float = 64.0,
-    far_m: float = 1e6,
+    margin_pixels: float = VIEW_MARGIN_PIXELS,
+    far_m: float = FARTHEST_M,
 ) -> Candidates:
     """List the surfels that project into the image or within a margin of it."""
     count = len(surfels)
@@ -68,9 +74,9 @@ def render_index_map(
     candidates: Candidates,
     T_world_camera: Float64,
     camera: PinholeCamera,
-    min_cosine: float = 0.1,
+    stable_confidence: float,
 ) -> tuple[Int32, Int64]:
-    """Splat each candidate into one pixel, the nearest wins.
+    """Splat each candidate into one pixel, the nearest wins, stable ones before specks within the noise.
 
     Returns the index map (H, W) int32, -1 where empty, and how many pixels of each row are filled (H,).
     """
@@ -79,14 +85,14 @@ def render_index_map(
     parts = split_range(chunks, min(get_num_threads(), 4)) if chunks else []
     buffers = np.full((max(1, len(parts)), *camera.shape), kernels.EMPTY, np.int64)
     transform, intrinsics = _camera_arrays(T_world_camera, camera)
-    arrays, cosine = surfels.arrays, np.float32(min_cosine)
+    arrays, stable = surfels.arrays, np.float32(stable_confidence)
 
     def splat(first: int, last: int) -> None:
         for part in range(first, last):
             start, stop = parts[part]
             kernels.splat(
-                start, stop, arrays.positions, arrays.normals, candidates.ids, candidates.counts,
-                transform, intrinsics, cosine, buffers[part],
+                start, stop, arrays.positions, arrays.normals, arrays.confidences, candidates.ids, candidates.counts,
+                transform, intrinsics, stable, buffers[part],
             )  # fmt: skip
 
     run_ranges(len(parts), splat)
@@ -96,10 +102,14 @@ def render_index_map(
 
 
 def render_model_view(
-    surfels: SurfelMap, candidates: Candidates, T_world_camera: Float64, camera: PinholeCamera
+    surfels: SurfelMap,
+    candidates: Candidates,
+    T_world_camera: Float64,
+    camera: PinholeCamera,
+    stable_confidence: float = 0.0,
 ) -> ModelView:
     """Return the visible surfels, one at most per pixel, in row-major order of the pixels."""
-    index_map, row_counts = render_index_map(surfels, candidates, T_world_camera, camera)
+    index_map, row_counts = render_index_map(surfels, candidates, T_world_camera, camera, stable_confidence)
     offsets = np.concatenate([[0], np.cumsum(row_counts)])
     total = int(offsets[-1])
     positions, normals = np.empty((3, total), np.float32), np.empty((3, total), np.float32)

@@ -52,7 +52,7 @@ class ProjectiveConfig:
     min_points: int = setting(200, "fewer matches than this give no answer", low=12)
     min_overlap: float = setting(0.05, "smaller shares of matched points give no answer", low=0.0, high=1.0)
     min_agreement: float = setting(
-        0.5, "share of the compared points that agree with the depth in a trusted answer", low=0.0, high=1.0
+        0.6, "share of the compared points that agree with the depth in a trusted answer", low=0.0, high=1.0
     )
     max_conflict: float = setting(
         0.06,
@@ -217,9 +217,16 @@ def schedules(config: ProjectiveConfig) -> Iterator[ProjectiveConfig]:
     """Yield the configured schedule, then wider and more tolerant ones for when it fails.
 
     Which coarse gate has the largest basin depends on the scene: one that is wide enough for the motion takes in wrong
-    neighbours. The free-space check tells a right answer from a wrong one, so trying several is safe.
+    neighbours. The free-space check tells a right answer from a wrong one, so trying several is safe; it is strict
+    where the search is wide, whatever the configuration allows to a prediction that is known to be close.
     """
     yield config
+    strict = ProjectiveConfig()
+    config = replace(
+        config,
+        min_agreement=max(config.min_agreement, strict.min_agreement),
+        max_conflict=min(config.max_conflict, strict.max_conflict),
+    )
     gate = config.coarse_gate_m * 2
     while gate <= config.widest_gate_m:
         yield replace(config, coarse_gate_m=gate, min_cosine=min(config.min_cosine, 0.0))

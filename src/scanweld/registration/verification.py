@@ -36,9 +36,9 @@ def check_against_depth(
 ) -> Agreement:
     """Compare points (3, N) with normals (3, N), source frame, with the depth of a target view.
 
-    On true poses of static scenes at most 3 % of the compared points stand in free space, recorded or rendered. In wrong
-    minima of the alignment it is mostly 9 % or more, though up to 80 % of the points may lie on a surface: the walls of
-    a room agree with themselves in many places (docs/decisions/0003-verification.md).
+    On true poses of static scenes at most 3 % of the compared points stand in free space, recorded or rendered. In
+    wrong minima of the alignment it is mostly 9 % or more, though up to 80 % of the points may lie on a surface: the
+    walls of a room agree with themselves in many places (docs/decisions/0003-verification.md).
     """
     stride = max(1, positions_m.shape[1] // SAMPLES)
     rotation, translation = (

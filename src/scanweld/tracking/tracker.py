@@ -25,7 +25,10 @@ class TrackingConfig:
         low=0.001,
         high=1.0,
     )
-    projective: ProjectiveConfig = section(ProjectiveConfig, "schedule and gates of the alignment")
+    # Looser than for unknown motions: the prediction is close, and somebody may walk through a third of the view.
+    projective: ProjectiveConfig = section(
+        lambda: ProjectiveConfig(min_agreement=0.4, max_conflict=0.35), "schedule and gates of the alignment"
+    )
 
     def __post_init__(self) -> None:
         check_ranges(self)

@@ -1,0 +1,119 @@
+"""How accurate the whole main job is, on every recorded sequence that is at hand. Prints a table, or JSON.
+
+    python benchmarks/accuracy.py [--data FOLDER] [--json]
+
+One default configuration for all; nothing is tuned per sequence.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+import scanweld as sw
+from scanweld.evaluation.surface_metrics import depth_completeness
+from scanweld.geometry import se3
+
+PAIRS = ((10, 40), (100, 130), (10, 50), (10, 100), (100, 200))
+
+
+def main() -> None:
+    """Run everything."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    default = os.environ.get("SCANWELD_DATA") or Path(__file__).parents[2] / "shared" / "data"
+    parser.add_argument("--data", type=Path, default=Path(default))
+    parser.add_argument("--json", action="store_true")
+    arguments = parser.parse_args()
+    rows = [*trajectories(arguments.data), *fusion(arguments.data), *pairs(arguments.data), *rendered()]
+    if arguments.json:
+        print(json.dumps(rows, indent=1))
+        return
+    for row in rows:
+        print(f"{row['what']:<62} {row['measured']:<44} asked: {row['asked']}")
+
+
+def trajectories(data: Path) -> Iterator[dict[str, Any]]:
+    """ATE of recorded sequences."""
+    for name, asked in (("livingroom1", "ATE <= 0.2 mm"), ("shelf_realsense", "ATE <= 5 mm")):
+        summary = sw.run_sequence(sw.open_sequence(data / name))
+        yield row(f"{name}, all frames", trajectory_text(summary.metrics), asked)
+
+
+def rendered() -> Iterator[dict[str, Any]]:
+    """ATE on rendered sequences with sensor noise."""
+    for config in (
+        sw.RenderConfig(scene="room", noise="kinect", width=320, height=240),
+        sw.RenderConfig(scene="room", path="sweep", noise="realsense", width=320, height=240),
+        sw.RenderConfig(scene="corridor", noise="kinect", width=320, height=240, frames=400),
+    ):
+        sequence = sw.SyntheticSequence(config)
+        summary = sw.run_sequence(sequence)
+        yield row(f"rendered {sequence.name} 320x240", trajectory_text(summary.metrics), "-")
+
+
+def trajectory_text(metrics: Any) -> str:
+    """ATE, how many frames were tracked, and the length of the path."""
+    return (
+        f"{metrics['ate_rmse_m'] * 1e3:.3f} mm, max {metrics['ate_max_m'] * 1e3:.2f}; "
+        f"{metrics['frames_tracked']}/{metrics['frames']}; {metrics['path_length_m']:.1f} m"
+    )
+
+
+def fusion(data: Path) -> Iterator[dict[str, Any]]:
+    """Compression ratio, and the share of the input within 1 cm of the map."""
+    sequence = sw.open_sequence(data / "livingroom1", frames="0:200", scale=0.5)
+    truth = sequence.ground_truth
+    for kind in ("given", "estimated"):
+        summary = sw.run_sequence(sequence, poses=truth if kind == "given" else None)
+        poses = [r.T_world_camera for r in summary.results]
+        points = summary.map.positions_m.T.astype(np.float64)
+        frames = ((sequence.read(k), poses[k]) for k in range(len(sequence)))
+        share = depth_completeness(points, frames, stride=2, thresholds_m=(0.01,), num_threads=-1).within[0.01]
+        yield row(
+            f"livingroom1 --scale 0.5 --frames 0:200, {kind} poses",
+            f"ratio {summary.metrics['compression_ratio']:.1f}, {share:.2%} within 1 cm",
+            "ratio > 11.28, >= 99 % within 1 cm",
+        )
+
+
+def pairs(data: Path) -> Iterator[dict[str, Any]]:
+    """Two frames from the identity."""
+    sequence = sw.open_sequence(data / "livingroom1")
+    truth = sequence.ground_truth.T_world_camera
+    for a, b in PAIRS:
+        result = sw.align_frames(sequence.read(a), sequence.read(b))
+        asked = "1 mm, 0.1 deg" if (a, b) in PAIRS[:2] else "honest status"
+        yield row(f"livingroom1 {a} -> {b}", pair_text(result, se3.inverse(truth[b]) @ truth[a]), asked)
+    camera = sw.PinholeCamera(525, 525, 319.5, 239.5, 640, 480)
+    for case in sorted((data / "tum_pairs").glob("case_*")):
+        frames, poses = [], []
+        for which in ("prev", "curr"):
+            depth = cv2.imread(str(case / f"dep_{which}.png"), cv2.IMREAD_UNCHANGED).astype(np.float32) / 5000
+            values = np.loadtxt(case / f"pose_{which}.txt")
+            frames.append(sw.Frame(0.0, depth, None, camera))
+            poses.append(se3.from_quaternion_xyzw(values[3:], values[:3]))
+        result = sw.align_frames(*frames)
+        yield row(f"tum_pairs {case.name}", pair_text(result, se3.inverse(poses[1]) @ poses[0]), "5 mm, 0.7 deg")
+
+
+def pair_text(result: sw.RegistrationResult, T_true: np.ndarray) -> str:
+    """Status and error of a two-frame alignment."""
+    error = se3.inverse(T_true) @ result.T_target_source
+    shift, turn = np.linalg.norm(error[:3, 3]) * 1e3, np.degrees(se3.rotation_angle_rad(error))
+    return f"{result.status.value}: {shift:.2f} mm, {turn:.3f} deg"
+
+
+def row(what: str, measured: str, asked: str) -> dict[str, Any]:
+    """One line of the table."""
+    return {"what": what, "measured": measured, "asked": asked}
+
+
+if __name__ == "__main__":
+    main()
