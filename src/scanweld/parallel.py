@@ -13,6 +13,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
+import sys
 import tempfile
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -29,7 +30,9 @@ def _kernel_cache_folder() -> Path:
     Numba does not notice that a called function in another module has changed, so a changed kernel must lead to
     a fresh folder.
     """
-    digest = hashlib.sha256()
+    # Numba files what it compiles by source path and Python version: each pair has a folder, so a note that all is
+    # compiled (see `kernels_are_cached`) holds for this installation.
+    digest = hashlib.sha256(f"{PACKAGE} {sys.version_info[:2]}".encode())
     for source in sorted([*PACKAGE.rglob("kernels.py"), Path(__file__)]):
         digest.update(source.relative_to(PACKAGE).as_posix().encode())
         digest.update(source.read_bytes())

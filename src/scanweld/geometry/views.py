@@ -22,6 +22,7 @@ class ModelView:
     normals : (3, N) float32, world frame, unit, towards the camera
     confidences : (N,) float32
     index_map : (H, W) int32, the surfel behind each pixel, -1 where none
+    stable_confidence : from this confidence on a surfel is stable
     """
 
     T_world_camera: Float64
@@ -30,6 +31,7 @@ class ModelView:
     normals: Float32
     confidences: Float32
     index_map: Int32
+    stable_confidence: float = 0.0
 
     def __len__(self) -> int:
         return int(self.positions_m.shape[1])

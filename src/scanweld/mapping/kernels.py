@@ -140,8 +140,9 @@ def associate_rows(
     """Decide for the pixels of rows start..stop what they do to the map; the map is only read.
 
     surface (H, W, 8), see `SurfaceLevel.surface`; transform (3, 4) camera -> world; parameters (5,): gate in standard
-    deviations, gate floor [m], least cosine of agreeing normals, free-space margin [m], spread [pixels]; row_counts (H,): new surfels;
-    action (H, W) uint8: MERGE with the pixel's own surfel, APPEND a new one, the own surfel is SEEN_THROUGH.
+    deviations, gate floor [m], least cosine of agreeing normals, free-space margin [m], spread [pixels]; row_counts
+    (H,): new surfels; action (H, W) uint8: MERGE with the pixel's own surfel, APPEND a new one, the own surfel is
+    SEEN_THROUGH.
     """
     height, width = index_map.shape
     sigmas, floor, min_cosine, margin = parameters[0], parameters[1], parameters[2], parameters[3]

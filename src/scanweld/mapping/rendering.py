@@ -123,7 +123,7 @@ def render_model_view(
         )  # fmt: skip
 
     run_ranges(camera.height, body)
-    return ModelView(T_world_camera, camera, positions, normals, confidences, index_map)
+    return ModelView(T_world_camera, camera, positions, normals, confidences, index_map, stable_confidence)
 
 
 @dataclass(frozen=True, slots=True)

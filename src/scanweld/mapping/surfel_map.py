@@ -22,6 +22,10 @@ _COLUMNS: tuple[tuple[str, int, type], ...] = (
 )
 
 
+ROW_PADDING = 2064
+"""Extra columns: 129 cache lines, so that neighbouring rows are 129 cache sets apart."""
+
+
 @dataclass(slots=True)
 class SurfelArrays:
     """The arrays themselves, longer than the map; only mapping code sees them.
@@ -42,8 +46,18 @@ class SurfelArrays:
 
     @classmethod
     def empty(cls, capacity: int) -> SurfelArrays:
-        """Allocate arrays for `capacity` surfels."""
-        return cls(*(np.zeros((rows, capacity) if rows > 1 else capacity, kind) for _, rows, kind in _COLUMNS))
+        """Allocate arrays for `capacity` surfels.
+
+        All rows lie in one block whose row length is not a power of two: equal positions in different rows would
+        otherwise fall into the same few sets of the cache and push each other out.
+        """
+        block = np.zeros((sum(rows for _, rows, _ in _COLUMNS), capacity + ROW_PADDING), np.float32)
+        columns, first = [], 0
+        for _, rows, kind in _COLUMNS:
+            column = block[first : first + rows].view(kind)
+            columns.append(column if rows > 1 else column[0])
+            first += rows
+        return cls(*columns)
 
 
 class SurfelMap:
@@ -58,6 +72,11 @@ class SurfelMap:
 
     def __len__(self) -> int:
         return self._count
+
+    @property
+    def capacity(self) -> int:
+        """Number of surfels that fit before the arrays are doubled."""
+        return self._arrays.radii.shape[0] - ROW_PADDING
 
     @property
     def positions_m(self) -> Float32:
@@ -106,7 +125,7 @@ class SurfelMap:
 
     def reserve(self, more: int) -> SurfelArrays:
         """Make room for `more` surfels behind the live ones and return the storage."""
-        needed, capacity = self._count + more, self._arrays.radii.shape[0]
+        needed, capacity = self._count + more, self.capacity
         if needed > capacity:
             while capacity < needed:
                 capacity *= 2
@@ -118,7 +137,7 @@ class SurfelMap:
 
     def extend(self, more: int, anchor: int = 0) -> None:
         """Count `more` surfels that a kernel wrote behind the live ones, anchored to a keyframe."""
-        if not 0 <= more <= self._arrays.radii.shape[0] - self._count:
+        if not 0 <= more <= self.capacity - self._count:
             raise InvalidInputError(f"map: cannot extend by {more}, reserve first")
         self._arrays.anchors[self._count : self._count + more] = anchor
         self._count += more

@@ -23,6 +23,7 @@ class ConstantVelocity:
         self._T_world_camera: Float64 = np.eye(4)
         self._timestamp_s: float | None = None
         self._velocity: Float64 = np.zeros(6)  # twist per second, in the camera's own frame
+        self._measured: tuple[float, Float64] | None = None  # when and where the camera was last seen
 
     def predict(self, timestamp_s: float) -> Float64:
         """Return T_world_camera (4, 4) at a time."""
@@ -33,9 +34,11 @@ class ConstantVelocity:
 
     def observe(self, timestamp_s: float, T_world_camera: Float64) -> None:
         """Take in a measured pose."""
-        if self._timestamp_s is not None and timestamp_s > self._timestamp_s:
-            step = se3.inverse(self._T_world_camera) @ T_world_camera
-            self._velocity = se3.log(step) / (timestamp_s - self._timestamp_s)
+        if self._measured is not None and timestamp_s > self._measured[0]:
+            # From measurement to measurement: what misses were guessed in between is no motion of the camera.
+            step = se3.inverse(self._measured[1]) @ T_world_camera
+            self._velocity = se3.log(step) / (timestamp_s - self._measured[0])
+        self._measured = timestamp_s, T_world_camera
         self._T_world_camera, self._timestamp_s = T_world_camera, timestamp_s
 
     def miss(self, timestamp_s: float) -> Float64:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
@@ -114,10 +115,12 @@ class Slam:
         Raises
         ------
         InvalidInputError
-            When the timestamp does not increase.
+            When the timestamp does not increase, or the given pose is no rigid transform.
         """
         clock = _Stopwatch()
         self._check_time(frame.timestamp_s)
+        if T_world_camera is not None:
+            T_world_camera = as_transform(T_world_camera, "T_world_camera")
         pyramid = build_pyramid(frame, self.surfaces)
         clock.lap("surfaces")
         predicted = self._motion.predict(frame.timestamp_s) if T_world_camera is None else T_world_camera
@@ -176,7 +179,8 @@ class Slam:
     def _judged(self, frame: Frame, predicted: Float64, aligned: RegistrationResult) -> FrameResult:
         """Turn an alignment into a state: no answer means LOST, and the motion model's pose."""
         lost = not aligned.status.has_pose
-        was_lost = bool(self.results) and self.results[-1].state is FrameState.LOST
+        looked_at = (r.state for r in reversed(self.results) if r.state is not FrameState.UNREADABLE)
+        was_lost = next(looked_at, None) is FrameState.LOST
         state = FrameState.LOST if lost else FrameState.RELOCALISED if was_lost else FrameState.TRACKING
         return FrameResult(
             index=len(self.results),
@@ -192,6 +196,8 @@ class Slam:
         )
 
     def _check_time(self, timestamp_s: float) -> None:
+        if not math.isfinite(timestamp_s):
+            raise InvalidInputError(f"frame: timestamp {timestamp_s} s is not a time")
         if self.results and timestamp_s <= self.results[-1].timestamp_s:
             raise InvalidInputError(
                 f"frame: timestamp {timestamp_s:.6f} s does not follow {self.results[-1].timestamp_s:.6f} s"

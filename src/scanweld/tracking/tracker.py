@@ -21,7 +21,7 @@ class TrackingConfig:
 
     stable_fraction: float = setting(
         1.0,
-        "track against this share of the visible surfels, the most stable ones; lower it against drift and for speed",
+        "track against this share of the stable surfels in view, the most stable; lower for speed, against drift",
         low=0.001,
         high=1.0,
     )
@@ -32,6 +32,10 @@ class TrackingConfig:
 
     def __post_init__(self) -> None:
         check_ranges(self)
+
+
+MIN_STABLE_SHARE = 0.5
+"""Share of the visible surfels that must be stable for the others to be left out."""
 
 
 class FrameToModelTracker:
@@ -72,10 +76,22 @@ class FrameToModelTracker:
         )
 
     def _select(self, view: ModelView) -> tuple[Float32, Float32]:
-        """Return the positions and normals of the most stable share of the visible surfels."""
-        wanted = round(self.config.stable_fraction * len(view))
-        if wanted >= len(view) or wanted < self.config.projective.min_points:
+        """Return the positions and normals (3, M) of the surfels to track against, in the order of the image.
+
+        Where half of the view is stable, only stable surfels count: the others are mostly noise. A map that is young or
+        new to this place has nothing better than all of them.
+        """
+        stable = np.flatnonzero(view.confidences >= view.stable_confidence)
+        if len(stable) < MIN_STABLE_SHARE * len(view):
+            stable = np.arange(len(view))
+        wanted = max(round(self.config.stable_fraction * len(stable)), self.config.projective.min_points)
+        if wanted < len(stable):
+            # Confidence stops growing, so ties are the rule: those at the limit are taken evenly over the image.
+            confidences = view.confidences[stable]
+            limit = np.partition(confidences, len(stable) - wanted)[len(stable) - wanted]
+            above, tied = np.flatnonzero(confidences > limit), np.flatnonzero(confidences == limit)
+            more = wanted - len(above)
+            stable = stable[np.sort(np.concatenate([above, tied[np.arange(more) * len(tied) // more]]))]
+        if len(stable) == len(view):
             return view.positions_m, view.normals
-        # Ties at the limit are broken by the place in the image, which stays spread: a stable sort does that.
-        chosen = np.sort(np.argsort(-view.confidences, kind="stable")[:wanted])
-        return np.ascontiguousarray(view.positions_m[:, chosen]), np.ascontiguousarray(view.normals[:, chosen])
+        return np.take(view.positions_m, stable, axis=1), np.take(view.normals, stable, axis=1)
