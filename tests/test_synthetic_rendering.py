@@ -215,9 +215,7 @@ def test_a_timed_path_is_sampled_on_its_own_clock() -> None:
 def test_files_give_the_same_frames_as_memory(tmp_path: Path) -> None:
     config = RenderConfig(**SMALL, frames=3, noise="realsense", seed=4)
     calls: list[tuple[int, int]] = []
-    written = render_sequence(
-        tmp_path / "s", config, progress=lambda done, total: calls.append((done, total))
-    )
+    written = render_sequence(tmp_path / "s", config, progress=lambda done, total: calls.append((done, total)))
     assert calls == [(1, 3), (2, 3), (3, 3)]
     assert sorted(p.name for p in tmp_path.iterdir()) == ["s"]
     names = {"rgb", "depth", "rgb.txt", "depth.txt", "associations.txt", "groundtruth.txt", "camera.json"}
@@ -243,9 +241,7 @@ def test_files_give_the_same_frames_as_memory(tmp_path: Path) -> None:
         np.testing.assert_array_equal(a.depth_m, b.depth_m)
         np.testing.assert_array_equal(a.color, b.color)
     assert read.ground_truth is not None
-    np.testing.assert_allclose(
-        read.ground_truth.T_world_camera, memory.ground_truth.T_world_camera, atol=1e-14
-    )
+    np.testing.assert_allclose(read.ground_truth.T_world_camera, memory.ground_truth.T_world_camera, atol=1e-14)
     np.testing.assert_array_equal(read.timestamps_s, memory.timestamps_s)
 
 

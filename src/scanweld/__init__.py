@@ -25,7 +25,12 @@ if TYPE_CHECKING:
         ScanweldError,
         UnreadableFrameError,
     )
-    from scanweld.evaluation.surface_metrics import surface_accuracy, surface_completeness
+    from scanweld.evaluation.surface_metrics import (
+        compression_ratio,
+        depth_completeness,
+        surface_accuracy,
+        surface_completeness,
+    )
     from scanweld.evaluation.trajectory_metrics import ate, rpe
     from scanweld.geometry import se3
     from scanweld.geometry.camera import PinholeCamera
@@ -44,6 +49,7 @@ if TYPE_CHECKING:
     from scanweld.mapping.surfel_map import SurfelMap
     from scanweld.parallel import set_num_threads
     from scanweld.registration.closed_form import align_closed_form
+    from scanweld.registration.explain import explain_horn, explain_icp
     from scanweld.registration.icp import IcpConfig, icp
     from scanweld.registration.projective import ProjectiveConfig
     from scanweld.registration.result import RegistrationResult, Status
@@ -63,7 +69,9 @@ _HOME = {
         "ConfigError", "DatasetError", "FileFormatError", "InvalidInputError", "MissingDependencyError", "OutputError",
         "ScanweldError", "UnreadableFrameError",
     ),
-    "evaluation.surface_metrics": ("surface_accuracy", "surface_completeness"),
+    "evaluation.surface_metrics": (
+        "compression_ratio", "depth_completeness", "surface_accuracy", "surface_completeness",
+    ),
     "evaluation.trajectory_metrics": ("ate", "rpe"),
     "geometry": ("se3",),
     "geometry.camera": ("PinholeCamera",),
@@ -82,6 +90,7 @@ _HOME = {
     "mapping.surfel_map": ("SurfelMap",),
     "parallel": ("set_num_threads",),
     "registration.closed_form": ("align_closed_form",),
+    "registration.explain": ("explain_horn", "explain_icp"),
     "registration.icp": ("IcpConfig", "icp"),
     "registration.projective": ("ProjectiveConfig",),
     "registration.result": ("RegistrationResult", "Status"),
@@ -134,7 +143,11 @@ __all__ = [
     "ate",
     "build_pyramid",
     "build_slam",
+    "compression_ratio",
+    "depth_completeness",
     "estimate_normals",
+    "explain_horn",
+    "explain_icp",
     "from_mapping",
     "icp",
     "open_sequence",

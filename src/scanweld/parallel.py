@@ -16,10 +16,12 @@ import os
 import sys
 import tempfile
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
+
+from scanweld.errors import InvalidInputError
 
 PACKAGE = Path(__file__).parent
 
@@ -91,7 +93,7 @@ def set_num_threads(count: int) -> None:
     """Use `count` threads from now on; results do not depend on it."""
     global _num_threads, _pool
     if count < 1:
-        raise ValueError(f"expected at least one thread, got {count}")
+        raise InvalidInputError(f"threads: expected at least one thread, got {count}")
     if _pool is not None and count != _num_threads:
         _pool.shutdown(wait=True)
         _pool = None
@@ -123,5 +125,15 @@ def run_ranges(count: int, body: Callable[[int, int], object]) -> None:
     try:
         body(*ranges[0])
     finally:
-        for future in futures:
-            future.result()
+        wait(futures)  # nobody writes into the caller's arrays once it goes on
+    for future in futures:
+        future.result()
+
+
+def _forget_pool() -> None:
+    global _pool
+    _pool = None
+
+
+if hasattr(os, "register_at_fork"):  # threads do not survive a fork: a child would wait for its parent's
+    os.register_at_fork(after_in_child=_forget_pool)

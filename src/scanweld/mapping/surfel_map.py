@@ -52,9 +52,10 @@ class SurfelArrays:
         otherwise fall into the same few sets of the cache and push each other out.
         """
         block = np.zeros((sum(rows for _, rows, _ in _COLUMNS), capacity + ROW_PADDING), np.float32)
-        columns, first = [], 0
+        columns: list[Array] = []
+        first = 0
         for _, rows, kind in _COLUMNS:
-            column = block[first : first + rows].view(kind)
+            column: Array = block[first : first + rows].view(kind)
             columns.append(column if rows > 1 else column[0])
             first += rows
         return cls(*columns)
@@ -76,7 +77,7 @@ class SurfelMap:
     @property
     def capacity(self) -> int:
         """Number of surfels that fit before the arrays are doubled."""
-        return self._arrays.radii.shape[0] - ROW_PADDING
+        return int(self._arrays.radii.shape[0]) - ROW_PADDING
 
     @property
     def positions_m(self) -> Float32:

@@ -43,7 +43,7 @@ def plot_tracking(results: Sequence[FrameResult], path: Path) -> None:
         axis.spines[["top", "right"]].set_visible(False)
     # The first frames compile or warm caches: they must not set the scale of the time axis.
     steady = np.asarray(rows[3][1])[min(5, len(results) - 1) :]
-    axes[3].set_ylim(0, 1.3 * float(np.percentile(steady, 98)))
+    axes[3].set_ylim(0, 1.3 * max(float(np.percentile(steady, 98)), 1.0))
     axes[1].set_ylim(0, 1.05)
     axes[3].set_xlabel("frame")
     axes[3].set_xlim(-0.5, max(len(results) - 0.5, 0.5))

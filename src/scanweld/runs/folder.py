@@ -24,6 +24,9 @@ def check_writable(folder: Path, *, force: bool) -> None:
     """Raise OutputError before any work is done when `folder` could not be written at the end."""
     if folder.exists() and not folder.is_dir():
         raise OutputError(f"{folder}: exists and is a file; choose another --out")
+    folder = folder.resolve()
+    if Path.cwd().is_relative_to(folder):
+        raise OutputError(f"{folder}: is or holds the current folder; choose another --out")
     if folder.is_dir() and any(folder.iterdir()):
         if not force:
             raise OutputError(f"{folder}: exists and is not empty; --force replaces it, --out writes elsewhere")
@@ -43,25 +46,34 @@ def write_folder(folder: Path, *, force: bool) -> Iterator[Path]:
         When the folder cannot be written, or exists and `force` is false.
     """
     check_writable(folder, force=force)
+    folder = folder.resolve()  # a link keeps pointing at the run
     with _created_parent(folder):
         aside = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
     try:
-        try:
-            yield aside
-        except OSError as error:
-            raise OutputError(f"{error.filename or folder}: cannot be written: {error.strerror or error}") from None
+        yield aside
         mask = os.umask(0)
         os.umask(mask)
         aside.chmod(0o777 & ~mask)  # temporary folders are private, results are not
-        if folder.exists():
-            old = aside.with_name(aside.name + ".old")
-            folder.rename(old)
-            aside.rename(folder)
-            shutil.rmtree(old)
-        else:
-            aside.rename(folder)
+        _put_in_place(aside, folder)
+    except OSError as error:
+        raise OutputError(f"{error.filename or folder}: cannot be written: {error.strerror or error}") from None
     finally:
         shutil.rmtree(aside, ignore_errors=True)
+
+
+def _put_in_place(aside: Path, folder: Path) -> None:
+    """Rename `aside` to `folder`; what was there goes away only once the new one is in its place."""
+    if not folder.exists():
+        aside.rename(folder)
+        return
+    old = aside.with_name(aside.name + ".old")
+    folder.rename(old)
+    try:
+        aside.rename(folder)
+    except OSError:
+        old.rename(folder)
+        raise
+    shutil.rmtree(old, ignore_errors=True)
 
 
 @contextlib.contextmanager

@@ -19,6 +19,7 @@ from scanweld.config import to_toml
 from scanweld.datasets.base import RgbdSequence
 from scanweld.evaluation.trajectory_metrics import AteResult
 from scanweld.evaluation.trajectory_plot import plot_trajectory_error
+from scanweld.geometry import se3
 from scanweld.geometry.camera import PinholeCamera
 from scanweld.io.ply import write_ply
 from scanweld.io.trajectory_files import write_tum
@@ -30,7 +31,9 @@ from scanweld.slam.motion import trajectory_of
 from scanweld.slam.system import Slam, SlamConfig
 from scanweld.trajectory import FrameResult, Trajectory
 
-RENDER_SIZE = (640, 480)
+RENDER_WIDTH = 800
+"""Width of the pictures of the map [pixels]."""
+
 PICTURE_CONFIDENCE = 2.0
 """Surfels below this are left out of pictures."""
 
@@ -89,13 +92,12 @@ def write_frames(path: Path, results: Sequence[FrameResult]) -> None:
 def write_renders(folder: Path, surfels: SurfelMap, trajectory: Trajectory, camera: PinholeCamera) -> None:
     """Draw the map in RGB and normals from three places of the path and from behind it all."""
     folder.mkdir()
-    factor = min(1.0, RENDER_SIZE[0] / camera.width)
-    view_camera = camera.scaled(factor) if factor < 1 else camera
+    view_camera = camera.scaled(RENDER_WIDTH / camera.width)
     places = {
         f"view-{k + 1}": trajectory.T_world_camera[round(s * (len(trajectory) - 1))]
         for k, s in enumerate((0.1, 0.5, 0.9))
     }
-    places["overview"] = overview_pose(surfels, trajectory)
+    places["overview"] = overview_pose(surfels, trajectory, view_camera)
     # What was seen about once is mostly noise at edges; a run too short to confirm anything shows all it has.
     least = PICTURE_CONFIDENCE if np.median(surfels.confidences) > 2 * PICTURE_CONFIDENCE else 0.0
     for name, T_world_camera in places.items():
@@ -104,21 +106,26 @@ def write_renders(folder: Path, surfels: SurfelMap, trajectory: Trajectory, came
             _write_png(folder / f"{name}-{kind}.png", image)
 
 
-def overview_pose(surfels: SurfelMap, trajectory: Trajectory) -> Float64:
-    """Return a pose behind and above the cameras that has most of the map in view."""
+def overview_pose(surfels: SurfelMap, trajectory: Trajectory, camera: PinholeCamera) -> Float64:
+    """Return a pose behind and above the cameras, as near as it can be with most of the map in view."""
     poses = trajectory.T_world_camera
     up = -poses[:, :3, 1].mean(axis=0)
     up /= max(float(np.linalg.norm(up)), 1e-9)
     points = surfels.positions_m[:, :: max(1, len(surfels) // 20_000)].T.astype(np.float64)
-    centre = np.median(points, axis=0)
-    size = float(np.percentile(np.linalg.norm(points - centre, axis=1), 90))
+    low, high = np.percentile(points, [2, 98], axis=0)
+    centre, size = (low + high) / 2, float(np.linalg.norm(high - low))
     back = poses[:, :3, 3].mean(axis=0) - centre
     back -= up * float(back @ up)
     if np.linalg.norm(back) < 0.05 * size:  # the cameras turned about the middle of the map: any side will do
         back = -poses[0, :3, 2]
-    back /= np.linalg.norm(back)
-    eye = centre + size * (1.7 * back + 1.1 * up)
-    return look_at(eye, centre, up)
+    direction = 1.7 * back / max(float(np.linalg.norm(back)), 1e-9) + 1.1 * up
+    near, far = 0.1 * size, 3.0 * size
+    for _ in range(12):
+        distance = (near + far) / 2
+        T = look_at(centre + distance * direction, centre, up)
+        _, inside = camera.project(se3.transform_points(se3.inverse(T), points))
+        near, far = (near, distance) if inside.mean() > 0.96 else (distance, far)
+    return look_at(centre + far * direction, centre, up)
 
 
 def look_at(eye_m: Float64, target_m: Float64, up: Float64) -> Float64:

@@ -66,6 +66,7 @@ class _Tally:
     """What is counted while frames go by."""
 
     num_points_input: int = 0
+    unit_doubted: bool = False
     warnings: list[str] = field(default_factory=list)
 
     def warn(self, message: str) -> None:
@@ -119,8 +120,8 @@ def run_sequence(
     try:
         _process_all(slam, sequence, given, tally, progress)
     except KeyboardInterrupt:
-        if not slam.results:
-            raise
+        if not any(result.state in POSED for result in slam.results):
+            raise  # there is nothing to keep
         interrupted = True
         tally.warn(f"interrupted after {len(slam.results)} of {len(sequence)} frames")
     if not any(result.state in POSED for result in slam.results):
@@ -157,9 +158,10 @@ def _process_all(
             else:
                 depth = record.frame.depth_m
                 tally.num_points_input += int(np.count_nonzero(depth))
-                if record.index < UNIT_CHECK_FRAMES and not tally.warnings and depth.any():
+                if record.index < UNIT_CHECK_FRAMES and not tally.unit_doubted and depth.any():
                     advice = check_depth_unit(float(np.median(depth[depth > 0])), sequence.depth_scale)
                     if advice:
+                        tally.unit_doubted = True
                         tally.warn(advice)
                 result = slam.process(record.frame, T_world_camera=pose)
             if progress is not None:

@@ -23,7 +23,7 @@ class TwoFrameConfig:
 
     surfaces: SurfaceConfig = section(SurfaceConfig, "how depth becomes surfaces")
     projective: ProjectiveConfig = section(
-        lambda: ProjectiveConfig(iterations=40, min_cosine=0.8, step_m=2e-5),
+        lambda: ProjectiveConfig(iterations=40, min_cosine=0.8),
         "schedule and gates of the alignment",
     )
 

@@ -1,0 +1,104 @@
+"""The command line as it is met first: help, wrong usage, narrow terminals, pipes."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from importlib.metadata import version
+
+import pytest
+
+from scanweld.cli.app import app
+
+OPTIONS = {
+    "demo": "--out --frames --threads --json",
+    "slam": "--out --format --camera --depth-scale --frames --scale --poses --config --set --threads --force --json "
+    "--tracked-only",
+    "register": "--method --scale --init --voxel --max-distance --threads --explain --plot --out --json",
+    "evaluate": "--align --json --plot",
+    "render": "--out --scene --path --path-frame --noise --frames --size --fps --seed --force",
+}
+"""What every command must offer."""
+
+
+def scanweld(*arguments: str, columns: int = 100, **environment: str) -> subprocess.CompletedProcess[str]:
+    """Run the command line in a process of its own."""
+    plain = {key: value for key, value in os.environ.items() if key not in ("FORCE_COLOR", "NO_COLOR", "TERM")}
+    return subprocess.run(
+        [sys.executable, "-m", "scanweld", *arguments],
+        capture_output=True, text=True, check=False, stdin=subprocess.DEVNULL,
+        env={**plain, "COLUMNS": str(columns), "PYTHONIOENCODING": "utf-8", **environment},
+    )  # fmt: skip
+
+
+def test_every_command_is_covered_here() -> None:
+    commands = {info.name or info.callback.__name__ for info in app.registered_commands if info.callback}
+    assert commands == set(OPTIONS)
+
+
+@pytest.mark.parametrize("columns", [40, 80, 100])
+@pytest.mark.parametrize("command", OPTIONS)
+def test_help_names_every_option(command: str, columns: int) -> None:
+    """Options are spelt out at any width, since a name that is cut short cannot be typed."""
+    done = scanweld(command, "--help", columns=columns)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert set(OPTIONS[command].split()) <= set(re.findall(r"--[a-z-]+", done.stdout))
+
+
+def test_help_fits_a_narrow_terminal() -> None:
+    """Lines are wrapped at 50 columns, below which the parser does not go; panels would be cut at 40."""
+    lines = scanweld("slam", "--help", columns=40).stdout.splitlines()
+    assert max(len(line) for line in lines) <= 50
+    assert not any("…" in line for line in lines)
+
+
+def test_short_help_option() -> None:
+    assert scanweld("slam", "-h").stdout == scanweld("slam", "--help").stdout
+
+
+def test_alone_it_shows_help() -> None:
+    done = scanweld()
+    assert done.returncode in (0, 2)  # the parser's versions differ
+    assert all(command in done.stdout + done.stderr for command in OPTIONS)
+    assert "Traceback" not in done.stderr
+
+
+def test_version() -> None:
+    assert scanweld("--version").stdout == version("scanweld") + "\n"
+
+
+@pytest.mark.parametrize("command", OPTIONS)
+def test_unknown_option_is_usage(command: str) -> None:
+    done = scanweld(command, "--no-such-option")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert "--no-such-option" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    "arguments", [["nope"], ["slam"], ["evaluate", "one"], ["demo", "--frames", "many"], ["demo", "--frames", "0"]]
+)
+def test_wrong_usage_exits_2(arguments: list[str]) -> None:
+    done = scanweld(*arguments)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("columns", [40, 100])
+def test_no_color_is_respected(columns: int) -> None:
+    done = scanweld("slam", "--help", columns=columns, NO_COLOR="1")
+    assert done.returncode == 0
+    assert "\x1b" not in done.stdout
+
+
+@pytest.mark.skipif(os.name == "nt", reason="needs a POSIX shell")
+@pytest.mark.parametrize("command", ["", "slam", "register"])
+def test_a_closed_pipe_is_no_error(command: str) -> None:
+    done = subprocess.run(
+        ["/bin/sh", "-c", f"'{sys.executable}' -m scanweld {command} --help | head -1"],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0
+    assert done.stderr == ""

@@ -1,0 +1,374 @@
+"""Point-based fusion against plain NumPy and the equations of Keller et al. 2013."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+from hypothesis import given, settings
+
+import scanweld as sw
+from rendered import CAMERA, frame_of, plane_depth, rendered
+from scanweld.geometry import se3
+from scanweld.geometry.depth import SurfacePyramid
+from scanweld.mapping.fusion import FusionConfig, radial_weight, remove_unstable
+from scanweld.mapping.rendering import find_candidates, render_index_map
+
+SMALL = sw.PinholeCamera(40.0, 41.0, 19.3, 14.8, 40, 30)
+ALL = ("positions_m", "normals", "colors", "radii_m", "confidences", "created", "last_seen", "anchors")
+
+
+def wall(
+    depth_m: float = 1.5, normal: tuple[float, ...] = (0, 0, 1), camera: sw.PinholeCamera = SMALL, color: int = 90
+) -> sw.SurfacePyramid:
+    frame = frame_of(plane_depth(normal, depth_m, camera), camera=camera)
+    return sw.build_pyramid(replace(frame, color=np.full((*camera.shape, 3), color, np.uint8)))
+
+
+def mapper_with(*pyramids: sw.SurfacePyramid, **settings: float) -> sw.SurfelMapper:
+    mapper = sw.SurfelMapper(FusionConfig(**settings))
+    for pyramid in pyramids:
+        mapper.fuse(pyramid, np.eye(4))
+    return mapper
+
+
+def content(surfels: sw.SurfelMap) -> bytes:
+    return b"".join(np.array(getattr(surfels, name)).tobytes() for name in ALL)
+
+
+def values_of(surfels: sw.SurfelMap) -> dict[str, np.ndarray]:
+    """What the map holds, colours with their fractions."""
+    values = {name: np.array(getattr(surfels, name)).astype(np.float64) for name in ALL}
+    return values | {"colors": surfels.arrays.colors[:, : len(surfels)].astype(np.float64)}
+
+
+class TestWeight:
+    @pytest.mark.parametrize("depth_m", [0.3, 1.0, 3.0, 7.5])
+    def test_new_surfel_on_the_optical_axis_weighs_one_at_any_depth(self, depth_m: float) -> None:
+        """gamma = 0 there, so alpha = exp(0) = 1 (golden 3; one known library has 3.7e-6 at 3 m)."""
+        camera = sw.PinholeCamera(40, 40, 20.0, 15.0, 41, 31)
+        surfels = mapper_with(wall(depth_m, camera=camera)).map
+        axis = np.argmin(np.abs(surfels.positions_m[:2]).sum(axis=0))
+        assert surfels.confidences[axis] == 1.0
+        assert surfels.confidences.max() == 1.0
+
+    def test_corner_weight(self) -> None:
+        """The furthest pixel has gamma = 1: alpha = exp(-1 / (2 * 0.6^2)) = exp(-1.3889) = 0.24935."""
+        camera = sw.PinholeCamera(500, 480, 300.3, 250.7, 640, 480)
+        weight = radial_weight(camera)
+        assert weight.min() == pytest.approx(0.24935, abs=1e-5)
+        assert np.unravel_index(weight.argmin(), weight.shape) == (0, 639)
+        corner = np.hypot(639 - 300.3, 250.7)
+        for v, u in ((0, 0), (251, 300), (100, 500), (479, 639)):
+            gamma = np.hypot(u - 300.3, v - 250.7) / corner
+            assert weight[v, u] == pytest.approx(np.exp(-(gamma**2) / (2 * 0.36)), rel=1e-6)
+
+
+def reference_fuse(
+    surfels: sw.SurfelMap, pyramid: SurfacePyramid, T: np.ndarray, config: FusionConfig, frame_id: int
+) -> dict[str, np.ndarray]:
+    """One pixel at a time: what the map holds after a frame."""
+    level, camera = pyramid.levels[0], pyramid.frame.camera
+    surface, alpha = level.surface.astype(np.float64), radial_weight(camera).astype(np.float64)
+    index_map, _ = render_index_map(surfels, find_candidates(surfels, T, camera), T, camera, config.stable_confidence)
+    old = values_of(surfels)
+    new = {name: values.copy() for name, values in old.items()}
+    appended: dict[str, list[object]] = {name: [] for name in ALL}
+    R, t = T[:3, :3], T[:3, 3]
+    for v, u in np.ndindex(*camera.shape):
+        row, i, color = surface[v, u], index_map[v, u], pyramid.frame.color[v, u].astype(float)
+        if row[6] == 0:
+            continue
+        q, n, weight = R @ row[:3] + t, R @ row[3:6], alpha[v, u]
+        gate = max(config.gate_sigma / row[6], config.gate_floor_m)
+
+        def agrees(j: int, q: np.ndarray = q, n: np.ndarray = n, gate: float = gate, radius: float = row[7]) -> bool:
+            offset = old["positions_m"][:, j] - q
+            facing = n @ old["normals"][:, j] > config.min_cosine
+            return abs(n @ offset) < gate and facing and np.linalg.norm(offset) < 4 * radius + gate
+
+        if i >= 0 and agrees(i):
+            w = old["confidences"][i]
+            new["positions_m"][:, i] = (w * old["positions_m"][:, i] + weight * q) / (w + weight)
+            new["colors"][:, i] = (w * old["colors"][:, i] + weight * color) / (w + weight)
+            normal = (w * old["normals"][:, i] + weight * n) / (w + weight)
+            new["normals"][:, i] = normal / np.linalg.norm(normal)
+            new["radii_m"][i] = min(old["radii_m"][i], 2 * row[7])
+            new["confidences"][i] = min(w + weight, config.max_confidence)
+            new["last_seen"][i] = frame_id
+            continue
+        covered = False
+        for y in range(max(0, v - 1), min(camera.height, v + 2)):
+            for x in range(max(0, u - 1), min(camera.width, u + 2)):
+                j = index_map[y, x]
+                if j >= 0 and j != i:
+                    c = R.T @ (old["positions_m"][:, j] - t)
+                    away = np.hypot(camera.fx * c[0] / c[2] + camera.cx - u, camera.fy * c[1] / c[2] + camera.cy - v)
+                    covered |= away < config.spread_pixels and agrees(j)
+        if not covered:
+            values = (q, n, color, row[7], weight, frame_id, frame_id, 0)
+            for name, value in zip(ALL, values, strict=True):
+                appended[name].append(value)
+        if i >= 0 and 0 < v < camera.height - 1 and 0 < u < camera.width - 1:
+            depth = (R.T @ (old["positions_m"][:, i] - t))[2]
+            if depth < surface[v - 1 : v + 2, u - 1 : u + 2, 2].min() - max(config.free_space_margin_m, 2 * gate):
+                new["confidences"][i] = max(old["confidences"][i] - weight, 0)
+    return {
+        name: np.concatenate([new[name], np.array(appended[name]).T.reshape(*new[name].shape[:-1], -1)], axis=-1)
+        for name in ALL
+    }
+
+
+class TestAgainstNumpy:
+    @pytest.mark.parametrize("seed", range(4))
+    def test_frame_into_a_random_map(self, seed: int) -> None:
+        """A map of a slanted wall, scattered surfels before and behind it, and a frame from a little aside."""
+        rng = np.random.default_rng(seed)
+        config = FusionConfig(unstable_frames=1000, clean_interval=1000, max_confidence=3.0)
+        mapper = sw.SurfelMapper(config)
+        for k in range(2):
+            depth = plane_depth((0.2, 0.1, 1), 1.5, SMALL) + 0.004 * rng.standard_normal(SMALL.shape)
+            frame = frame_of(depth, camera=SMALL)
+            color = rng.integers(0, 256, (*SMALL.shape, 3)).astype(np.uint8)
+            pyramid = sw.build_pyramid(replace(frame, color=color))
+            mapper.fuse(pyramid, se3.exp([0.01 * k, 0, 0, 0, 0.01 * k, 0]))
+        count = 150
+        points = SMALL.rays().reshape(-1, 3)[rng.integers(0, 1200, count)] * rng.uniform(0.9, 2.2, (count, 1))
+        mapper.map.append(
+            points.T.astype(np.float32), np.tile(np.array([[0], [0], [-1]], np.float32), count),
+            rng.integers(0, 256, (3, count)), np.full(count, 0.01, np.float32),
+            rng.uniform(0.1, 2, count).astype(np.float32), 1,
+        )  # fmt: skip
+        depth = plane_depth((0.2, 0.1, 1), 1.5, SMALL) + 0.004 * rng.standard_normal(SMALL.shape)
+        depth[10:14, 20:30] = 0
+        color = rng.integers(0, 256, (*SMALL.shape, 3)).astype(np.uint8)
+        pyramid = sw.build_pyramid(replace(frame_of(depth, camera=SMALL), color=color))
+        T = se3.exp([0.02, -0.01, 0.01, 0.01, 0.02, -0.01])
+        expected = reference_fuse(mapper.map, pyramid, T, config, 2)
+        before, confidences = len(mapper.map), mapper.map.confidences.copy()
+        counts = mapper.fuse(pyramid, T)
+        assert len(mapper.map) == expected["radii_m"].shape[0]
+        assert counts.appended == len(mapper.map) - before > 20
+        changed = mapper.map.confidences[:before] - confidences
+        assert (changed > 0).sum() > 100
+        assert (changed < 0).sum() > 3
+        for name, values in values_of(mapper.map).items():
+            np.testing.assert_allclose(values, expected[name], atol=1e-3 if name == "colors" else 2e-5, err_msg=name)
+
+    def test_rendered_frames_in_turn(self) -> None:
+        sequence, config = rendered(noise="kinect", count=40), FusionConfig()
+        mapper = sw.SurfelMapper(config)
+        for k, pose in enumerate(sequence.ground_truth.T_world_camera[:3]):
+            pyramid = sw.build_pyramid(sequence.frames[k])
+            expected = reference_fuse(mapper.map, pyramid, pose, config, k)
+            mapper.fuse(pyramid, pose)
+            # A pixel or two sit on the edge of a gate in float32.
+            assert len(mapper.map) == pytest.approx(expected["radii_m"].shape[0], abs=4)
+        assert 10_000 < len(mapper.map) < 40_000
+
+
+class TestMerging:
+    @settings(max_examples=30)
+    @given(
+        a=st.floats(-0.002, 0.002), b=st.floats(-0.002, 0.002), tilt=st.floats(-0.1, 0.1),
+        colors=st.tuples(st.integers(0, 255), st.integers(0, 255)),
+    )  # fmt: skip
+    def test_two_measurements_of_equal_weight_give_the_mean_in_either_order(
+        self, a: float, b: float, tilt: float, colors: tuple[int, int]
+    ) -> None:
+        first, second = wall(1.5 + a, color=colors[0]), wall(1.5 + b, (0.1 * tilt, 0, 1), color=colors[1])
+        forth, back = mapper_with(first, second).map, mapper_with(second, first).map
+        if len(forth) != len(back):  # the walls are more than a gate apart at the side: surfels were added
+            return
+        np.testing.assert_allclose(forth.positions_m, back.positions_m, atol=2e-6)
+        np.testing.assert_allclose(forth.normals, back.normals, atol=2e-6)
+        np.testing.assert_allclose(forth.confidences, back.confidences, rtol=1e-6)
+        single = mapper_with(first).map
+        if len(single) == len(forth):
+            assert forth.confidences.sum() == pytest.approx(2 * single.confidences.sum(), rel=1e-5)
+            middle = (single.positions_m + mapper_with(second).map.positions_m) / 2
+            np.testing.assert_allclose(forth.positions_m, middle, atol=2e-6)
+            assert np.abs(forth.colors.astype(int) - (colors[0] + colors[1]) / 2).max() <= 0.51
+
+    def test_mean_of_many_and_normals_stay_unit(self) -> None:
+        """Ten walls within the gate: the map is at their mean, the confidence ten times the first."""
+        depths = 1.5 + 0.002 * np.random.default_rng(1).standard_normal(10)
+        mapper = mapper_with(*(wall(d) for d in depths))
+        single = mapper_with(wall(1.5)).map
+        assert len(mapper.map) == len(single)
+        np.testing.assert_allclose(mapper.map.positions_m[2], depths.mean(), atol=1e-5)
+        np.testing.assert_allclose(mapper.map.confidences, 10 * single.confidences, rtol=1e-5)
+        np.testing.assert_allclose(np.linalg.norm(mapper.map.normals, axis=0), 1, atol=1e-6)
+        assert (mapper.map.created == 0).all()
+        assert (mapper.map.last_seen == 9).all()
+
+    def test_confidence_is_capped(self) -> None:
+        mapper = mapper_with(*[wall()] * 6, max_confidence=3.0)
+        assert mapper.map.confidences.max() == 3.0
+
+    def test_same_view_again_appends_nothing(self) -> None:
+        pyramid = sw.build_pyramid(rendered(count=40).frames[0])
+        mapper = mapper_with(pyramid)
+        seen = int((pyramid.levels[0].surface[..., 6] > 0).sum())
+        assert len(mapper.map) == seen
+        counts = mapper.fuse(pyramid, np.eye(4))
+        assert counts.appended < 0.01 * seen
+
+    def test_frame_without_depth_changes_nothing(self) -> None:
+        mapper = mapper_with(wall())
+        before = content(mapper.map)
+        counts = mapper.fuse(sw.build_pyramid(frame_of(np.zeros(SMALL.shape), camera=SMALL)), np.eye(4))
+        assert (counts.appended, counts.removed) == (0, 0)
+        assert content(mapper.map) == before
+
+    def test_opposite_faces_are_two_surfaces(self) -> None:
+        """The front and the back of a thin board must not merge, however near they are."""
+        mapper = mapper_with(wall(1.5))
+        front = len(mapper.map)
+        behind = se3.exp([0, 0, 3.001, 0, np.pi, 0])
+        behind[:3, 3] = [0, 0, 3.001]
+        mapper.fuse(wall(1.5), behind)
+        assert len(mapper.map) == pytest.approx(2 * front, rel=0.05)
+        assert (mapper.map.confidences <= 1).all()
+
+    def test_moving_the_world_frame_moves_the_map(self) -> None:
+        sequence = rendered(count=40)
+        T = se3.exp([0.5, -1, 2, 0.4, -0.8, 0.3])
+        plain, moved = sw.SurfelMapper(), sw.SurfelMapper()
+        for k in range(3):
+            pyramid, pose = sw.build_pyramid(sequence.frames[k]), sequence.ground_truth.T_world_camera[k]
+            plain.fuse(pyramid, pose)
+            moved.fuse(pyramid, T @ pose)
+        assert len(moved.map) == pytest.approx(len(plain.map), rel=2e-3)
+        a = T[:3, :3] @ plain.map.positions_m + T[:3, 3:]
+        for axis in range(3):
+            np.testing.assert_allclose(
+                np.percentile(a[axis], [1, 25, 50, 75, 99]),
+                np.percentile(moved.map.positions_m[axis], [1, 25, 50, 75, 99]), atol=5e-3,
+            )  # fmt: skip
+
+    @pytest.mark.parametrize("layout", ["view of BGR", "columns first", "read-only"])
+    def test_any_memory_layout_of_the_image(self, layout: str) -> None:
+        """Views of BGR images and read-only buffers give the same map, without compiling the kernels anew."""
+        from scanweld.mapping import kernels
+
+        frame = rendered(count=40).frames[0]
+        expected = mapper_with(sw.build_pyramid(frame)).map
+        compiled = len(kernels.append_rows.signatures), len(kernels.merge_rows.signatures)
+        color, depth = frame.color.copy(), frame.depth_m.copy()
+        if layout == "read-only":
+            color.flags.writeable = depth.flags.writeable = False
+        elif layout == "columns first":
+            color, depth = np.asfortranarray(color), np.asfortranarray(depth)
+        else:
+            color = color[..., ::-1].copy()[..., ::-1]
+        mapper = mapper_with(*[sw.build_pyramid(replace(frame, color=color, depth_m=depth))] * 2)
+        np.testing.assert_array_equal(mapper.map.colors, expected.colors)
+        assert (len(kernels.append_rows.signatures), len(kernels.merge_rows.signatures)) == compiled
+
+    def test_frame_without_colour_is_grey(self) -> None:
+        frame = replace(rendered(count=40).frames[0], color=None)
+        assert np.ptp(mapper_with(sw.build_pyramid(frame)).map.colors) == 0
+
+    def test_pose_far_from_the_last_view_does_not_double_the_map(self) -> None:
+        """`view` remembers what was near; a frame that is fused elsewhere must still meet the whole map."""
+        camera = sw.PinholeCamera(300, 300, 79.5, 59.5, 160, 120)
+        pyramid = wall(1.5, camera=camera)
+        mapper = mapper_with(pyramid)
+        before = len(mapper.map)
+        elsewhere = se3.exp([0, 0, 0, 0, np.radians(30), 0])
+        assert len(mapper.view(elsewhere, camera)) < before / 2
+        assert mapper.fuse(pyramid, np.eye(4)).appended < 0.01 * before
+
+
+class TestFreeSpace:
+    def test_surfel_that_is_looked_through_loses_the_weight_of_the_pixel(self) -> None:
+        mapper = mapper_with(wall(1.0), wall(1.0), wall(1.0))
+        before = mapper.map.confidences.copy()
+        count = len(mapper.map)
+        mapper.fuse(wall(1.5), np.eye(4))
+        u, v = (np.rint(SMALL.project(mapper.map.positions_m[:, :count].T)[0]).astype(int)).T
+        inner = (u > 2) & (u < SMALL.width - 3) & (v > 1) & (v < SMALL.height - 2)
+        lost = (before - mapper.map.confidences[:count])[inner]
+        np.testing.assert_allclose(lost, radial_weight(SMALL)[v, u][inner], rtol=1e-5)
+        assert len(mapper.map) > 1.9 * count  # the wall behind is there too
+
+    def test_margin_keeps_what_is_hardly_in_front(self) -> None:
+        """At 1.5 m the gate is 3 (0.0012 + 0.0019 * 1.21) = 10.5 mm, so the margin of 5 cm rules: 4 cm stay."""
+        mapper = mapper_with(wall(1.46))
+        before = mapper.map.confidences.copy()
+        mapper.fuse(wall(1.5), np.eye(4))
+        assert (mapper.map.confidences[: len(before)] >= before).all()
+
+    def test_hidden_surfels_keep_their_confidence(self) -> None:
+        mapper = mapper_with(wall(2.0))
+        before = mapper.map.confidences.copy()
+        mapper.fuse(wall(1.0), np.eye(4))
+        np.testing.assert_array_equal(mapper.map.confidences[: len(before)], before)
+
+    def test_object_that_left_is_removed(self) -> None:
+        """A box before a wall, seen three times, then gone: after as many looks and a cleaning it has left the map."""
+        with_box = plane_depth((0, 0, 1), 2.0, SMALL)
+        with_box[10:20, 14:26] = 1.2
+        box, bare = sw.build_pyramid(frame_of(with_box, camera=SMALL)), wall(2.0)
+        mapper = mapper_with(*[box] * 3)
+        assert (mapper.map.positions_m[2] < 1.5).sum() > 40
+        for _ in range(13):
+            mapper.fuse(bare, np.eye(4))
+        assert (mapper.map.positions_m[2] < 1.5).sum() == 0
+        assert (mapper.map.positions_m[2] > 1.9).sum() > 900
+
+    def test_what_was_looked_through_can_be_confirmed_again(self) -> None:
+        """A flickering measurement must not throw a surfel about: its weight never becomes negative."""
+        near, far = wall(1.0), wall(1.5)
+        mapper = mapper_with(near, clean_interval=1000)
+        count = len(mapper.map)
+        for pyramid in (far, far, near):
+            mapper.fuse(pyramid, np.eye(4))
+        assert (mapper.map.confidences >= 0).all()
+        np.testing.assert_allclose(mapper.map.positions_m[2, :count], 1.0, atol=1e-4)
+        assert np.isfinite(mapper.map.positions_m).all()
+
+
+class TestRemoval:
+    def test_unstable_surfels_go_after_their_time_and_stable_ones_stay(self) -> None:
+        config = FusionConfig(stable_confidence=2.0, unstable_frames=10)
+        surfels = sw.SurfelMap()
+        confidence = np.array([1.9, 2.0, 1.0, 0.0, 50.0], np.float32)
+        vectors = np.zeros((3, 5), np.float32)
+        surfels.append(vectors, vectors, vectors, confidence, confidence, 0)
+        assert remove_unstable(surfels, 10, config) == 1  # only the one without any confidence
+        assert remove_unstable(surfels, 11, config) == 2
+        np.testing.assert_array_equal(surfels.confidences, [2.0, 50.0])
+
+    def test_a_speck_is_gone_after_the_time_of_grace(self) -> None:
+        """Seen once, then out of view: removed at the first cleaning after `unstable_frames`."""
+        mapper = mapper_with(wall(), unstable_frames=5, clean_interval=4, stable_confidence=3.0)
+        away = se3.exp([0, 0, 0, 0, np.pi, 0])
+        sizes = []
+        for _ in range(9):
+            mapper.fuse(sw.build_pyramid(frame_of(np.zeros(SMALL.shape), camera=SMALL)), away)
+            sizes.append(len(mapper.map))
+        assert sizes[:7] == [sizes[0]] * 7  # frames 1 to 7; frame 4 is a cleaning, but too early
+        assert sizes[7] == 0
+
+
+def test_fused_wall_lies_where_it_is() -> None:
+    """Poses and depth exact: every surfel of 30 frames of the room is on a surface that was seen."""
+    sequence = rendered(count=40)
+    mapper = sw.SurfelMapper()
+    for k in range(0, 40, 4):
+        mapper.fuse(sw.build_pyramid(sequence.frames[k]), sequence.ground_truth.T_world_camera[k])
+    last = sequence.frames[20]
+    pose = sequence.ground_truth.T_world_camera[20]
+    surface = sw.build_pyramid(last).levels[0].surface
+    points = se3.transform_points(se3.inverse(pose), mapper.map.positions_m.T)
+    pixels, inside = CAMERA.project(points)
+    u, v = np.rint(pixels[inside]).astype(int).T
+    offset = np.abs(((points[inside] - surface[v, u, :3]) * surface[v, u, 3:6]).sum(axis=1))
+    visible = (surface[v, u, 6] > 0) & (np.abs(points[inside][:, 2] - surface[v, u, 2]) < 0.05)
+    assert visible.sum() > 8000
+    assert np.median(offset[visible]) < 5e-4
+    assert np.percentile(offset[visible], 90) < 5e-3

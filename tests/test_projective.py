@@ -1,0 +1,316 @@
+"""The projective aligner: its sums against plain NumPy, its answers on rendered frames, and its honesty."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+from hypothesis import given, settings
+
+import scanweld as sw
+from rendered import CAMERA, frame_of, plane_depth, pose_error, rendered
+from scanweld.geometry import se3
+from scanweld.geometry.depth import SurfaceLevel, surface_image
+from scanweld.registration import kernels
+from scanweld.registration.projective import ProjectiveConfig, ProjectiveStep, align_projective, projective_step
+from scanweld.tracking.two_frames import surface_points
+
+SMALL = sw.PinholeCamera(40.0, 41.0, 19.3, 14.8, 40, 30)
+
+
+def random_target(seed: int) -> SurfaceLevel:
+    """A surface image of random vertices, normals and noise; a fifth has no normal."""
+    rng = np.random.default_rng(seed)
+    depth = rng.uniform(1.0, 1.3, SMALL.shape).astype(np.float32)
+    normals = rng.standard_normal((*SMALL.shape, 3)) * 0.4 - [0, 0, 1]
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    inverse_sigma = rng.uniform(50, 400, SMALL.shape)
+    inverse_sigma[rng.random(SMALL.shape) < 0.2] = 0
+    surface = np.concatenate(
+        [SMALL.rays() * depth[..., None], normals, inverse_sigma[..., None], np.zeros((*SMALL.shape, 1))], -1
+    ).astype(np.float32)
+    return SurfaceLevel(SMALL, depth, surface)
+
+
+def random_source(seed: int, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Points in front of, beside and behind the camera of `random_target`, normals about towards it."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform([-0.9, -0.7, 0.9], [0.9, 0.7, 1.4], (count, 3))
+    points[: count // 10, 2] *= -1
+    normals = rng.standard_normal((count, 3)) * 0.4 - [0, 0, 1]
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    return points.T.astype(np.float32).copy(), normals.T.astype(np.float32).copy()
+
+
+def reference_sums(
+    positions: np.ndarray,
+    normals: np.ndarray,
+    T: np.ndarray,
+    target: SurfaceLevel,
+    gate: float,
+    config: ProjectiveConfig,
+) -> dict[str, object]:
+    """The normal equations one point at a time: A_i = n^T [I | -[p]_x], b_i = n . (p - q), Huber weights."""
+    camera, information, gradient = target.camera, np.zeros((6, 6)), np.zeros(6)
+    loss, squared, inliers, matched, projected = 0.0, 0.0, 0, 0, 0
+    for x, direction in zip(positions.T.astype(np.float64), normals.T.astype(np.float64), strict=True):
+        p = T[:3, :3] @ x + T[:3, 3]
+        if p[2] <= 1e-3:
+            continue
+        u = int(np.floor(camera.fx * p[0] / p[2] + camera.cx + 0.5))
+        v = int(np.floor(camera.fy * p[1] / p[2] + camera.cy + 0.5))
+        if not (0 <= u < camera.width and 0 <= v < camera.height):
+            continue
+        projected += 1
+        row = target.surface[v, u].astype(np.float64)
+        q, n, s = row[0:3], row[3:6], row[6]
+        if s == 0 or np.linalg.norm(p - q) >= gate or n @ T[:3, :3] @ direction <= config.min_cosine:
+            continue
+        matched += 1
+        skew = np.array([[0, -p[2], p[1]], [p[2], 0, -p[0]], [-p[1], p[0], 0]])
+        A = s * np.concatenate([n, -n @ skew])
+        r = s * n @ (p - q)
+        k = config.robust_sigma
+        weight = 1.0 if abs(r) <= k else k / abs(r)
+        inliers += abs(r) <= k
+        loss += r * r / 2 if abs(r) <= k else k * (abs(r) - k / 2)
+        information += weight * np.outer(A, A)
+        gradient += weight * r * A
+        squared += weight * r * r
+    total = np.trace(information[:3, :3])
+    return {
+        "information": information, "gradient": gradient, "loss": loss / max(matched, 1),
+        "rmse_m": np.sqrt(squared / total) if total else 0.0,
+        "counts": (inliers, matched, projected),
+    }  # fmt: skip
+
+
+def step_at(
+    T: np.ndarray, source: tuple[np.ndarray, np.ndarray], target: SurfaceLevel, gate: float, **changes: float
+) -> ProjectiveStep:
+    return projective_step(*source, T, target, gate, ProjectiveConfig(**changes), np.zeros(3), 1.0)
+
+
+class TestSums:
+    @pytest.mark.parametrize("count", [0, 1, 511, 512, 513, kernels.CHUNK, 2 * kernels.CHUNK + 700])
+    def test_match_numpy(self, count: int) -> None:
+        target, source = random_target(1), random_source(2, count)
+        T = se3.exp([0.03, -0.02, 0.05, 0.1, -0.05, 0.2])
+        changes = {"min_cosine": 0.6, "robust_sigma": 8.0}
+        step = step_at(T, source, target, 0.15, **changes)
+        expected = reference_sums(*source, T, target, 0.15, ProjectiveConfig(**changes))
+        assert (step.num_inliers, step.num_matched, step.num_projected) == expected["counts"]
+        if count > 500:
+            assert 0 < step.num_inliers < step.num_matched < step.num_projected < count
+        scale = np.sqrt(np.abs(np.diag(expected["information"]))) + 1e-9
+        units = np.outer(scale, scale)
+        information = step.equations.information
+        np.testing.assert_allclose(information / units, expected["information"] / units, atol=1e-5)
+        tolerance = 1e-5 * np.sqrt(count) * scale + 1e-9  # of Cauchy and Schwarz's bound |g| <= |J| |r|, |r| < 10
+        assert (np.abs(step.equations.gradient - expected["gradient"]) <= tolerance).all()
+        assert step.loss == pytest.approx(expected["loss"], rel=1e-4)
+        assert step.rmse_m == pytest.approx(expected["rmse_m"], rel=1e-4)
+
+    def test_in_plane_offset_has_no_residual(self) -> None:
+        """n = (1, 1, 0) / sqrt 2, offset (1, -1, 0): the residual is 0 (golden 1)."""
+        surface = np.zeros((*SMALL.shape, 8), np.float32)
+        surface[..., 0:3], surface[..., 3:6], surface[..., 6] = [-1, 1, 5], [0.5**0.5, 0.5**0.5, 0], 1
+        point = np.array([[0], [0], [5]], np.float32)
+        normal = np.array([[0.5**0.5], [0.5**0.5], [0]], np.float32)
+        step = step_at(np.eye(4), (point, normal), SurfaceLevel(SMALL, surface[..., 2], surface), 10.0)
+        assert step.num_matched == 1
+        assert step.loss == pytest.approx(0, abs=1e-12)
+
+    def test_each_gate_alone(self) -> None:
+        """One point 4 cm in front of a wall: a gate of 3 cm, a normal at 60 degrees, and no normal refuse it."""
+        wall = surface_image(plane_depth((0, 0, 1), 1.0, SMALL), SMALL, sw.SurfaceConfig())
+        level = SurfaceLevel(SMALL, wall[..., 2], wall)
+        point = np.array([[0.0], [0.0], [0.96]], np.float32)
+        straight = np.array([[0.0], [0.0], [-1.0]], np.float32)
+        tilted = np.array([[np.sin(np.pi / 3)], [0.0], [-0.5]], np.float32)
+        assert step_at(np.eye(4), (point, straight), level, 0.05, min_cosine=0.6).num_matched == 1
+        assert step_at(np.eye(4), (point, straight), level, 0.03, min_cosine=0.6).num_matched == 0
+        assert step_at(np.eye(4), (point, tilted), level, 0.05, min_cosine=0.6).num_matched == 0
+        assert step_at(np.eye(4), (point, tilted), level, 0.05, min_cosine=0.4).num_matched == 1
+        blank = SurfaceLevel(SMALL, wall[..., 2], np.where(np.arange(8) > 2, 0, wall).astype(np.float32))
+        assert step_at(np.eye(4), (point, straight), blank, 0.05).num_matched == 0
+
+    @pytest.mark.parametrize(("u", "v", "inside"), [
+        (-0.49, 3, True), (-0.51, 3, False), (39.49, 3, True), (39.51, 3, False),
+        (3, -0.49, True), (3, -0.51, False), (3, 29.49, True), (3, 29.51, False),
+    ])  # fmt: skip
+    def test_image_spans_half_a_pixel_around_its_centres(self, u: float, v: float, inside: bool) -> None:
+        point = np.array([[(u - SMALL.cx) / SMALL.fx], [(v - SMALL.cy) / SMALL.fy], [1.0]], np.float32)
+        step = step_at(np.eye(4), (point, -np.eye(3, 1, -2, dtype=np.float32)), random_target(3), 1.0)
+        assert step.num_projected == inside
+
+    def test_gradient_and_information_are_derivatives_for_left_perturbations(self) -> None:
+        """On a plane r does not depend on which pixel is matched, so the cost is smooth: with T <- exp(xi) T its
+        first derivative is g, and the change of g is H xi."""
+        wall = surface_image(plane_depth((0.3, -0.2, 1), 1.5), CAMERA, sw.SurfaceConfig(noise_growth=0))
+        level = SurfaceLevel(CAMERA, wall[..., 2], wall)
+        rng = np.random.default_rng(4)
+        points = (CAMERA.rays()[20:100:3, 20:140:3].reshape(-1, 3) * rng.uniform(1.3, 1.7, (40 * 27, 1))).T
+        normals = np.tile(np.array([[-0.3], [0.2], [-1]]) / np.sqrt(1.13), points.shape[1])
+        source = points.astype(np.float32).copy(), normals.astype(np.float32).copy()
+        T = se3.exp([0.01, 0.02, -0.01, 0.02, 0.01, -0.03])
+
+        def at(xi: np.ndarray) -> ProjectiveStep:
+            return step_at(se3.exp(xi) @ T, source, level, 10.0, robust_sigma=1e6)
+
+        def cost(xi: np.ndarray) -> float:
+            step = at(xi)
+            return step.loss * step.num_matched
+
+        here, h = at(np.zeros(6)), 1e-3
+        assert here.num_matched == points.shape[1]
+        slopes = [(cost(h * e) - cost(-h * e)) / (2 * h) for e in np.eye(6)]
+        np.testing.assert_allclose(here.equations.gradient, slopes, rtol=2e-3, atol=1e-3 * np.abs(slopes).max())
+        # r is linear in the translation, so there Gauss-Newton's Hessian is the true one.
+        curvature = [(at(h * e).equations.gradient - at(-h * e).equations.gradient) / (2 * h) for e in np.eye(6)[:3]]
+        H = here.equations.information
+        np.testing.assert_allclose(np.array(curvature)[:, :3], H[:3, :3], atol=1e-3 * np.abs(H[:3, :3]).max())
+
+
+@lru_cache(maxsize=1)
+def room_points() -> tuple[tuple[SurfaceLevel, ...], np.ndarray, np.ndarray]:
+    pyramid = sw.build_pyramid(rendered(count=40).frames[0])
+    return (pyramid.levels, *surface_points(pyramid))
+
+
+twists = st.lists(st.floats(-1, 1), min_size=6, max_size=6).map(np.array)
+
+
+class TestAnswers:
+    @settings(max_examples=25)
+    @given(twists)
+    def test_recovers_small_motions_of_a_rendered_frame(self, direction: np.ndarray) -> None:
+        """The frame against its own points from up to 6 cm and 4 degrees off: nothing but rounding is left."""
+        levels, positions, normals = room_points()
+        start = se3.exp(direction * [0.06, 0.06, 0.06, 0.07, 0.07, 0.07])
+        result = align_projective(positions, normals, levels, start, ProjectiveConfig(iterations=40, step_m=1e-5))
+        assert result.status is sw.Status.CONVERGED
+        shift, turn = pose_error(result.T_target_source, np.eye(4))
+        assert shift < 2e-4
+        assert turn < 0.01
+        assert result.overlap > 0.95
+        assert result.unobservable == ()
+
+    @settings(max_examples=10)
+    @given(twists, twists)
+    def test_moving_the_source_frame_moves_the_answer(self, frame: np.ndarray, direction: np.ndarray) -> None:
+        levels, positions, normals = room_points()
+        T_source_new = se3.exp(frame)
+        moved = se3.transform_points(se3.inverse(T_source_new), positions.T).T.astype(np.float32).copy()
+        turned = (T_source_new[:3, :3].T @ normals).astype(np.float32).copy()
+        start = se3.exp(0.02 * direction)
+        plain = align_projective(positions, normals, levels, start)
+        shifted = align_projective(moved, turned, levels, start @ T_source_new)
+        shift, turn = pose_error(shifted.T_target_source, plain.T_target_source @ T_source_new)
+        assert shift < 1e-4
+        assert turn < 0.01
+        assert shifted.status is plain.status
+
+    def test_history_and_arguments(self) -> None:
+        levels, positions, normals = room_points()
+        start = se3.exp([0.02, 0, 0, 0, 0.02, 0])
+        before = positions.copy(), normals.copy(), start.copy(), levels[0].surface.copy()
+        result = align_projective(positions, normals, levels, start, keep_history=True)
+        assert len(result.history) == result.num_iterations
+        assert [step.level for step in result.history] == sorted((s.level for s in result.history), reverse=True)
+        assert result.history[-1].rmse_m < result.history[0].rmse_m
+        for then, now in zip(before, (positions, normals, start, levels[0].surface), strict=True):
+            np.testing.assert_array_equal(then, now)
+        assert align_projective(positions, normals, levels, start).history == ()
+
+    def test_same_bytes_at_any_number_of_threads(self) -> None:
+        from scanweld.parallel import get_num_threads
+
+        levels, positions, normals = room_points()
+        many = np.tile(positions, 3), np.tile(normals, 3)
+        usual, answers = get_num_threads(), set()
+        try:
+            for threads in (1, 2, 3, 8):
+                sw.set_num_threads(threads)
+                result = align_projective(*many, levels, se3.exp([0.02] * 6))
+                answers.add(result.T_target_source.tobytes() + result.information.tobytes())
+        finally:
+            sw.set_num_threads(usual)
+        assert len(answers) == 1
+
+
+class TestHonesty:
+    @pytest.mark.parametrize("normal", [(0, 0, 1), (0.4, -0.2, 1)])
+    def test_wall_slid_in_itself_is_degenerate(self, normal: tuple[float, ...]) -> None:
+        """A plane leaves two translations in it and the rotation about its normal free; they stay at the guess."""
+        frame = frame_of(plane_depth(normal, 1.5))
+        pyramid = sw.build_pyramid(frame)
+        n = np.array(normal) / np.linalg.norm(normal)
+        along = np.cross(n, [0, 1, 0])
+        start = np.eye(4)
+        start[:3, 3] = 0.15 * along / np.linalg.norm(along)
+        result = align_projective(*surface_points(pyramid), pyramid.levels, start)
+        assert result.status is sw.Status.DEGENERATE
+        words = [direction.words for direction in result.unobservable]
+        assert len(words) == 3
+        assert [text.split()[0] for text in words] == ["translation", "translation", "rotation"]
+        for direction in result.unobservable[:2]:
+            assert abs(direction.vector[:3] @ n) < 0.02
+        turn = result.unobservable[2].vector[3:]
+        assert abs(turn @ n) / np.linalg.norm(turn) > 0.999
+        assert all(text in result.note for text in words)
+        np.testing.assert_allclose(result.T_target_source, start, atol=1e-3)
+
+    def test_edge_of_two_walls_leaves_one_direction_free(self) -> None:
+        """Two walls that meet in a vertical edge: only the translation along the edge is free."""
+        left, right = plane_depth((0.6, 0, 1), 1.5), plane_depth((-0.6, 0, 1), 1.5)
+        pyramid = sw.build_pyramid(frame_of(np.minimum(left, right)))
+        result = align_projective(*surface_points(pyramid), pyramid.levels, se3.exp([0.01, 0.05, 0.01, 0, 0, 0]))
+        assert result.status is sw.Status.DEGENERATE
+        assert [direction.words for direction in result.unobservable] == ["translation along (0.00, 1.00, 0.00)"]
+        np.testing.assert_allclose(result.T_target_source[:3, 3], [0, 0.05, 0], atol=2e-3)
+
+    def test_no_depth_is_too_few(self) -> None:
+        levels, positions, normals = room_points()
+        empty = sw.build_pyramid(frame_of(np.zeros(CAMERA.shape)))
+        for result in (
+            align_projective(positions, normals, empty.levels, np.eye(4)),
+            align_projective(*surface_points(empty), levels, np.eye(4)),
+            align_projective(positions[:, :100].copy(), normals[:, :100].copy(), levels, np.eye(4)),
+        ):
+            assert result.status is sw.Status.TOO_FEW_CORRESPONDENCES
+            assert "fewer than" in result.note
+            assert np.isfinite(result.T_target_source).all()
+
+    def test_wrong_start_never_ends_in_a_wrong_converged(self) -> None:
+        """Starts from 0.1 to 1 m and from 5 to 90 degrees off: every CONVERGED answer is right."""
+        levels, positions, normals = room_points()
+        right = wrong = 0
+        rng = np.random.default_rng(5)
+        for shift_m, turn_deg in [(0.1, 0), (0.3, 0), (1.0, 0), (0, 10), (0, 30), (0, 90), (0.3, 20), (1.0, 60)]:
+            for _ in range(6):
+                axes = rng.standard_normal((2, 3))
+                axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+                start = se3.exp([0, 0, 0, *np.radians(turn_deg) * axes[0]])
+                start[:3, 3] = shift_m * axes[1]
+                result = align_projective(positions, normals, levels, start)
+                assert np.isfinite(result.T_target_source).all()
+                if result.status is sw.Status.CONVERGED:
+                    shift, turn = pose_error(result.T_target_source, np.eye(4))
+                    assert max(shift / 0.01, turn / 0.5) < 1, (shift_m, turn_deg, start, result)
+                    right += 1
+                else:
+                    assert result.note
+                    wrong += 1
+        assert right >= 6  # the near starts do arrive
+        assert wrong >= 12  # and the far ones say that they did not
+
+    def test_no_iterations_left_says_so(self) -> None:
+        levels, positions, normals = room_points()
+        config = replace(ProjectiveConfig(iterations=1), step_m=1e-7)
+        result = align_projective(positions, normals, levels, se3.exp([0.03, 0, 0, 0, 0, 0]), config)
+        assert result.status is sw.Status.MAX_ITERATIONS
+        assert "still moving after 3 iterations" in result.note

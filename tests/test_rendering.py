@@ -1,0 +1,214 @@
+"""The map seen from a pose, against a plain NumPy z-buffer, and pictures of discs whose outline is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import scanweld as sw
+from scanweld.geometry import se3
+from scanweld.mapping import kernels
+from scanweld.mapping.rendering import find_candidates, render_index_map, render_model_view, render_picture
+
+SMALL = sw.PinholeCamera(40.0, 42.0, 19.3, 14.8, 40, 30)
+POSE = se3.exp([0.3, -0.2, 0.1, 0.4, -0.3, 0.2])
+
+
+def cloud(seed: int, count: int, T_world_camera: np.ndarray = POSE) -> sw.SurfelMap:
+    """Surfels all around the camera, a third in view, facing anywhere."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform([-1, -0.8, -0.5], [1, 0.8, 2], (count, 3)) @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
+    normals = rng.standard_normal((count, 3)) - 0.8 * T_world_camera[:3, 2]
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    surfels = sw.SurfelMap()
+    surfels.append(
+        points.T.astype(np.float32), normals.T.astype(np.float32), rng.integers(0, 256, (3, count)),
+        np.full(count, 0.01, np.float32), rng.random(count).astype(np.float32), 0,
+    )  # fmt: skip
+    return surfels
+
+
+def seen_from(surfels: sw.SurfelMap, T_world_camera: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Camera-frame points and normals, pixel coordinates u and v."""
+    T = np.linalg.inv(T_world_camera)
+    p = T[:3, :3] @ surfels.positions_m + T[:3, 3:]
+    n = T[:3, :3] @ surfels.normals
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return p, n, SMALL.fx * p[0] / p[2] + SMALL.cx, SMALL.fy * p[1] / p[2] + SMALL.cy
+
+
+def index_map_of(surfels: sw.SurfelMap, T_world_camera: np.ndarray, stable: float = 0) -> tuple[np.ndarray, ...]:
+    candidates = find_candidates(surfels, T_world_camera, SMALL)
+    return render_index_map(surfels, candidates, T_world_camera, SMALL, stable)
+
+
+def reference_index_map(surfels: sw.SurfelMap, T_world_camera: np.ndarray, stable: float) -> np.ndarray:
+    """Nearest surfel of each pixel, facing the camera to a cosine of 0.1; doubtful ones count as 2 % further."""
+    p, n, u, v = seen_from(surfels, T_world_camera)
+    index_map, buffer = np.full(SMALL.shape, -1), np.full(SMALL.shape, np.inf)
+    for i in range(len(surfels)):
+        cosine = -(n[:, i] @ p[:, i]) / np.linalg.norm(p[:, i])
+        if p[2, i] <= 0.01 or cosine < 0.1:
+            continue
+        depth = p[2, i] * (1.02 if surfels.confidences[i] < stable else 1.0)
+        row, column = int(np.floor(v[i] + 0.5)), int(np.floor(u[i] + 0.5))
+        if 0 <= row < SMALL.height and 0 <= column < SMALL.width and depth < buffer[row, column]:
+            index_map[row, column], buffer[row, column] = i, depth
+    return index_map
+
+
+@pytest.mark.parametrize("stable", [0.0, 0.5])
+@pytest.mark.parametrize("count", [0, 1, 5000, kernels.CHUNK + 300])
+def test_index_map_matches_a_numpy_z_buffer(count: int, stable: float) -> None:
+    surfels = cloud(1, count)
+    index_map, row_counts = index_map_of(surfels, POSE, stable)
+    np.testing.assert_array_equal(index_map, reference_index_map(surfels, POSE, stable))
+    np.testing.assert_array_equal(row_counts, (index_map >= 0).sum(axis=1))
+
+
+def test_candidates_are_those_near_the_image_in_order() -> None:
+    surfels = cloud(2, 3 * kernels.CHUNK // 2)
+    candidates = find_candidates(surfels, POSE, SMALL, margin_pixels=5.0, far_m=1.5)
+    listed = [candidates.ids[c * kernels.CHUNK :][:n] for c, n in enumerate(candidates.counts)]
+    p, _, u, v = seen_from(surfels, POSE)
+    inside = (p[2] > 0.01) & (p[2] < 1.5) & (u > -5) & (u < SMALL.width + 5) & (v > -5) & (v < SMALL.height + 5)
+    assert 0.05 < inside.mean() < 0.95
+    np.testing.assert_array_equal(np.concatenate(listed), np.flatnonzero(inside))
+
+
+def test_same_view_at_any_number_of_threads() -> None:
+    from scanweld.parallel import get_num_threads
+
+    surfels, usual, views = cloud(3, 5 * kernels.CHUNK), get_num_threads(), set()
+    try:
+        for threads in (1, 2, 3, 8):
+            sw.set_num_threads(threads)
+            view = render_model_view(surfels, find_candidates(surfels, POSE, SMALL), POSE, SMALL)
+            picture = render_picture(surfels, POSE, SMALL)
+            views.add(view.index_map.tobytes() + view.positions_m.tobytes() + picture.color.tobytes())
+    finally:
+        sw.set_num_threads(usual)
+    assert len(views) == 1
+
+
+def test_model_view_gathers_the_surfels_of_its_pixels() -> None:
+    surfels = cloud(4, 4000)
+    view = sw.SurfelMapper()
+    view.map = surfels
+    seen = view.view(POSE, SMALL)
+    ids = seen.index_map[seen.index_map >= 0]
+    assert len(seen) == len(ids) > 100
+    np.testing.assert_array_equal(seen.positions_m, surfels.positions_m[:, ids])
+    np.testing.assert_array_equal(seen.normals, surfels.normals[:, ids])
+    np.testing.assert_array_equal(seen.confidences, surfels.confidences[ids])
+
+
+def test_speck_does_not_hide_the_surface_it_belongs_to() -> None:
+    """A doubtful surfel 1 % nearer than a stable one loses, 3 % nearer it wins."""
+    for nearer, winner in ((0.99, 0), (0.97, 1)):
+        surfels = append_disc(sw.SurfelMap(), [0, 0, 1], [0, 0, -1], 0.05, confidence=9)
+        append_disc(surfels, [0, 0, nearer], [0, 0, -1], 0.05, confidence=1)
+        assert index_map_of(surfels, np.eye(4), stable=5.0)[0].max() == winner
+
+
+def test_equal_depth_has_one_winner() -> None:
+    """Two surfels in one place: the first one wins, always."""
+    surfels = disc([0, 0, 1], [0, 0, -1], 0.05)
+    surfels.append(surfels.positions_m, surfels.normals, surfels.colors, surfels.radii_m, surfels.confidences, 0)
+    index_map, _ = index_map_of(surfels, np.eye(4))
+    assert index_map.max() == 0
+
+
+@pytest.mark.parametrize("far_m", [1500, 2200, 3000, 5000, 9000, 1e5])
+def test_far_surfels_do_not_win_by_overflow(far_m: float) -> None:
+    """The depth in micrometres must fit its part of the key, however far a surfel is."""
+    surfels = disc([0, 0, far_m], [0, 0, -1], 0.05)
+    append_disc(surfels, [0, 0, 1], [0, 0, -1], 0.05)
+    index_map, _ = index_map_of(surfels, np.eye(4))
+    assert set(np.unique(index_map)) == {-1, 1}
+
+
+def disc(centre: list[float], normal: list[float], radius: float, color: int = 200) -> sw.SurfelMap:
+    return append_disc(sw.SurfelMap(), centre, normal, radius, color)
+
+
+def append_disc(
+    surfels: sw.SurfelMap,
+    centre: list[float],
+    normal: list[float],
+    radius: float,
+    color: int = 200,
+    confidence: float = 1,
+) -> sw.SurfelMap:
+    n = np.array(normal) / np.linalg.norm(normal)
+    surfels.append(
+        np.array(centre, np.float32)[:, None], n[:, None].astype(np.float32), np.full((3, 1), color),
+        np.array([radius], np.float32), np.array([confidence], np.float32), 0,
+    )  # fmt: skip
+    return surfels
+
+
+@pytest.mark.parametrize("normal", [(0, 0, -1), (0.5, 0, -1), (0.3, -0.8, -1)])
+def test_disc_covers_the_pixels_whose_rays_meet_it(normal: tuple[float, ...]) -> None:
+    """Drawn: rays that meet the disc's plane within the radius plus three quarters of a pixel."""
+    centre, radius = np.array([0.1, -0.05, 1.0]), 0.2
+    picture = render_picture(disc([*centre], [*normal], radius), np.eye(4), SMALL)
+    n = np.array(normal) / np.linalg.norm(normal)
+    t = (n @ centre) / (SMALL.rays() @ n)
+    distance = np.linalg.norm(SMALL.rays() * t[..., None] - centre, axis=-1)
+    pixel = 0.75 / SMALL.fx
+    drawn = np.isfinite(picture.depth_m)
+    assert drawn[distance < radius].all()
+    assert not drawn[distance > radius + 1.01 * pixel].any()
+    np.testing.assert_allclose(picture.depth_m[drawn], t[drawn], rtol=1e-4)
+    assert (picture.color[drawn] == 200).all()
+    assert (picture.color[~drawn] == 255).all()
+    np.testing.assert_allclose(picture.normals[drawn], np.broadcast_to(n, picture.normals[drawn].shape), atol=1e-6)
+    assert not picture.normals[~drawn].any()
+
+
+def test_nearest_disc_is_on_top_whatever_the_order() -> None:
+    for order in ((0.8, 1.2), (1.2, 0.8)):
+        surfels = sw.SurfelMap()
+        for z in order:
+            append_disc(surfels, [0, 0, z], [0, 0, -1], 0.1, color=int(100 * z))
+        picture = render_picture(surfels, np.eye(4), SMALL)
+        assert picture.color[15, 19].tolist() == [80, 80, 80]
+        assert picture.depth_m[15, 19] == pytest.approx(0.8)
+
+
+def test_discs_seen_from_behind_or_behind_the_camera_are_not_drawn() -> None:
+    for surfels in (disc([0, 0, 1], [0, 0, 1], 0.3), disc([0, 0, -1], [0, 0, -1], 0.3)):
+        assert not np.isfinite(render_picture(surfels, np.eye(4), SMALL).depth_m).any()
+
+
+def test_picture_of_an_empty_map_is_background() -> None:
+    picture = render_picture(sw.SurfelMap(), np.eye(4), SMALL, background=17)
+    assert (picture.color == 17).all()
+    assert (picture.normal_colors(np.eye(4)) == 255).all()
+
+
+def test_doubtful_surfels_can_be_left_out() -> None:
+    surfels = append_disc(sw.SurfelMap(), [0, 0, 1], [0, 0, -1], 0.1, confidence=2)
+    assert np.isfinite(render_picture(surfels, np.eye(4), SMALL, min_confidence=2).depth_m).any()
+    assert not np.isfinite(render_picture(surfels, np.eye(4), SMALL, min_confidence=2.1).depth_m).any()
+
+
+def test_normals_as_colours() -> None:
+    """Towards the camera is (128, 128, 255); facing right is red, facing up is green, whatever the camera's pose."""
+    for normal, color in (((0, 0, -1), (128, 128, 255)), ((1, 0, -1), (218, 128, 218)), ((0, -1, -1), (128, 218, 218))):
+        n = POSE[:3, :3] @ np.array(normal, float)
+        centre = POSE[:3, :3] @ [0, 0, 1] + POSE[:3, 3]
+        picture = render_picture(disc([*centre], [*n], 0.2), POSE, SMALL)
+        np.testing.assert_allclose(picture.normal_colors(POSE)[15, 19].astype(int), color, atol=1)
+
+
+def test_view_does_not_depend_on_the_world_frame() -> None:
+    surfels, T = cloud(5, 3000), se3.exp([1, -2, 0.5, 0.3, 1.0, -0.4])
+    moved = sw.SurfelMap()
+    positions = (T[:3, :3] @ surfels.positions_m + T[:3, 3:]).astype(np.float32)
+    normals = (T[:3, :3] @ surfels.normals).astype(np.float32)
+    moved.append(positions, normals, surfels.colors, surfels.radii_m, surfels.confidences, 0)
+    a, b = index_map_of(surfels, POSE)[0], index_map_of(moved, T @ POSE)[0]
+    assert (a >= 0).sum() > 300
+    assert (a != b).mean() < 0.005  # float32 rounding at the borders of pixels
