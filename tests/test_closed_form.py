@@ -238,6 +238,18 @@ def test_moving_both_sets_moves_the_answer(seed):
     np.testing.assert_allclose(moved, G @ align_closed_form(a, b).T_target_source @ se3.inverse(F), atol=1e-10)
 
 
+@pytest.mark.parametrize(("size", "weight"), [(1.0, 1e-200), (1.0, 1e200), (1e-100, 1.0)])
+def test_tiny_and_huge_units_and_weights_change_nothing(size, weight):
+    """sum w |a|^2 of the two sets may fit a float64 though its product does not."""
+    rng = np.random.default_rng(4)
+    a, T = rng.normal(size=(20, 3)), se3.exp([1, 2, 3, 0.5, -1, 0.3])
+    b = se3.transform_points(T, a)
+    result = align_closed_form(size * a, size * b, weights=np.full(20, weight))
+    assert result.status is Status.CONVERGED
+    np.testing.assert_allclose(result.T_target_source[:3, :3], T[:3, :3], atol=1e-12)
+    np.testing.assert_allclose(result.T_target_source[:3, 3], size * T[:3, 3], atol=1e-12 * size)
+
+
 def test_weights_count_pairs():
     """A weight of 3 is the pair three times, a weight of 0 is no pair."""
     rng = np.random.default_rng(0)

@@ -372,3 +372,7 @@ def test_fused_wall_lies_where_it_is() -> None:
     assert visible.sum() > 8000
     assert np.median(offset[visible]) < 5e-4
     assert np.percentile(offset[visible], 90) < 5e-3
+
+
+def test_weight_of_an_image_of_one_pixel_is_one() -> None:
+    np.testing.assert_array_equal(radial_weight(sw.PinholeCamera(10, 10, 0, 0, 1, 1)), [[1.0]])

@@ -12,9 +12,11 @@ from hypothesis import given, settings
 
 import scanweld as sw
 from rendered import CAMERA, frame_of, plane_depth, pose_error, rendered
+from scanweld.datasets.synthetic import NOISE_MODELS, degrade_depth
 from scanweld.geometry import se3
 from scanweld.geometry.depth import SurfaceLevel, surface_image
 from scanweld.registration import kernels
+from scanweld.registration.gauss_newton import NormalEquations, solve, spectrum
 from scanweld.registration.projective import ProjectiveConfig, ProjectiveStep, align_projective, projective_step
 from scanweld.tracking.two_frames import surface_points
 
@@ -263,6 +265,43 @@ class TestHonesty:
         assert abs(turn @ n) / np.linalg.norm(turn) > 0.999
         assert all(text in result.note for text in words)
         np.testing.assert_allclose(result.T_target_source, start, atol=1e-3)
+
+    @pytest.mark.parametrize("noise", ["kinect", "realsense"])
+    @pytest.mark.parametrize("normal", [(0, 0, 1), (0.3, 0.1, 1)])
+    def test_noisy_wall_is_degenerate_too(self, normal: tuple[float, ...], noise: str) -> None:
+        """The scatter of noisy normals is no relief: two looks at a blank wall, 15 cm apart, say nothing about the
+        slide, which stays at the guess to a few standard deviations of a pixel (3 to 6 mm at 1.5 m)."""
+        depth = plane_depth(normal, 1.5)
+        sides = [degrade_depth(depth, CAMERA, NOISE_MODELS[noise], np.random.default_rng(seed)) for seed in (1, 2)]
+        source, target = (sw.build_pyramid(frame_of(side)) for side in sides)
+        along = np.cross(normal, [0, 1, 0])
+        start = np.eye(4)
+        start[:3, 3] = 0.15 * along / np.linalg.norm(along)
+        result = align_projective(*surface_points(source), target.levels, start)
+        assert result.status is sw.Status.DEGENERATE
+        assert len(result.unobservable) == 3
+        shift, turn = pose_error(result.T_target_source, start)
+        assert shift < 5e-3
+        assert turn < 0.5
+
+    @pytest.mark.parametrize("count", [1, 2, 3])
+    def test_held_directions_do_not_move(self, count: int) -> None:
+        """The step stays orthogonal to them and solves the normal equations in the rest."""
+        rng = np.random.default_rng(count)
+        J = rng.standard_normal((50, 6))
+        centroid, radius = np.array([0.3, -0.2, 1.5]), 0.7
+        equations = NormalEquations(J.T @ J, J.T @ rng.standard_normal(50), 50.0, centroid, radius)
+        held = np.linalg.qr(rng.standard_normal((6, count)))[0]
+        parts = spectrum(equations, held=held)
+        assert parts.observable.sum() == 6 - count
+        xi = solve(equations, parts)
+        at_centroid = np.concatenate([xi[:3] + np.cross(xi[3:], centroid), xi[3:] * radius])
+        np.testing.assert_allclose(held.T @ at_centroid, 0, atol=1e-12)
+        to_origin = np.eye(6)
+        to_origin[:3, 3:] = -np.cross(np.eye(3), centroid).T
+        to_origin[:, 3:] /= radius
+        others = to_origin @ np.linalg.svd(held)[0][:, count:]
+        np.testing.assert_allclose(others.T @ (equations.information @ xi + equations.gradient), 0, atol=1e-9)
 
     def test_edge_of_two_walls_leaves_one_direction_free(self) -> None:
         """Two walls that meet in a vertical edge: only the translation along the edge is free."""

@@ -422,6 +422,18 @@ class TestGivenPoses:
         summary = sw.run_sequence(sequence, poses=poses.subset([1]))
         assert [r.state.value for r in summary.results] == ["unreadable", "tracking", "unreadable"]
 
+    def test_no_poses_at_all(self) -> None:
+        none = sw.Trajectory(np.zeros(0), np.zeros((0, 4, 4)))
+        with pytest.raises(sw.InvalidInputError, match="the trajectory is empty"):
+            sw.run_sequence(rendered(count=40).part(0, 3), poses=none)
+
+    def test_frames_without_depth_leave_no_map_and_nothing_else(self, tmp_path: Path) -> None:
+        sequence = rendered(count=40).part(0, 3)
+        changes: dict[int, sw.Frame | None] = {k: blind(sequence.frames[k]) for k in range(3)}
+        with pytest.raises(sw.DatasetError, match="the map is empty"):
+            sw.run_sequence(sequence.with_frames(changes), poses=rendered(count=40).ground_truth, out=tmp_path / "run")
+        assert list(tmp_path.iterdir()) == []
+
     def test_no_pose_belongs_to_a_frame(self) -> None:
         poses = rendered(count=40).ground_truth
         far = sw.Trajectory(poses.timestamps_s + 100, poses.T_world_camera)

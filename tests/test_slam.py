@@ -124,6 +124,24 @@ class TestStates:
         np.testing.assert_allclose(slam.skip(0.0, "damaged").T_world_camera, start, atol=1e-12)
         np.testing.assert_allclose(slam.process(rendered(count=40).frames[1]).T_world_camera, start, atol=1e-12)
 
+    @pytest.mark.parametrize("change", ["pairs", "gap"])
+    def test_irregular_timestamps_do_not_lose_the_camera(self, change: str) -> None:
+        """Frames stamped two by two 0.5 ms apart, and a pause of ten seconds in which the camera stood still."""
+        times = np.arange(12) / 30
+        if change == "pairs":
+            times[1::2] = times[0::2] + 0.0005
+        else:
+            times[6:] += 10
+        frames = rendered(count=40).frames[:12]
+        slam = run([replace(frame, timestamp_s=float(t)) for frame, t in zip(frames, times, strict=True)])
+        assert {result.state for result in slam.results} == {TRACKING}
+
+    def test_blind_frame_at_a_given_pose_keeps_the_world(self) -> None:
+        frames, start = rendered(count=40).frames, se3.exp([5, 0, 0, 0, 0, 0.3])
+        slam = sw.build_slam(CAMERA)
+        slam.process(blind(frames[0]), T_world_camera=start)
+        np.testing.assert_allclose(slam.process(frames[1]).T_world_camera, start, atol=1e-12)
+
     def test_world_frame_is_the_callers(self) -> None:
         start = rendered(count=40).ground_truth.T_world_camera[0]
         slam = run(rendered(count=40).frames[:6], T_world_first=start)
@@ -150,7 +168,8 @@ class TestStates:
     def test_unrelated_frame_is_lost_and_not_fused(self) -> None:
         slam = run(rendered(count=40).frames[:5])
         before = map_bytes(slam.map)
-        foreign = replace(rendered("corridor", count=40).frames[0], timestamp_s=10.0)
+        # Frames 0 to 15 of the corridor look at a wall about as far away, which the tracker takes for the room's.
+        foreign = replace(rendered("corridor", count=40).frames[30], timestamp_s=slam.results[-1].timestamp_s + 1 / 30)
         assert slam.process(foreign).state is LOST
         assert map_bytes(slam.map) == before
 
@@ -310,6 +329,22 @@ class TestMotionModel:
             model.miss(time)
         model.observe(5.0, se3.exp([5, 0, 0, 0, 0, 0]))
         assert model.predict(6.0)[0, 3] == pytest.approx(6.0)
+
+    def test_timestamps_that_are_too_near_do_not_throw_the_camera(self) -> None:
+        """0.01 m within 0.5 ms is 20 m/s; carried on for the next 66 ms it would be 1.3 m, at most it is 0.04 m."""
+        model = ConstantVelocity()
+        model.observe(0.0, np.eye(4))
+        model.observe(0.0005, se3.exp([0.01, 0, 0, 0, 0, 0]))
+        assert model.predict(0.0665)[0, 3] == pytest.approx(0.05)
+
+    def test_motion_is_not_carried_over_a_long_gap(self) -> None:
+        """0.01 m in 0.1 s; a minute later four such steps have been taken, a tenth of a second later one."""
+        model = ConstantVelocity()
+        for k in range(2):
+            model.observe(0.1 * k, se3.exp([0.01 * k, 0, 0, 0, 0, 0]))
+        assert model.predict(0.2)[0, 3] == pytest.approx(0.02)
+        assert model.predict(60.0)[0, 3] == pytest.approx(0.05)
+        assert model.miss(60.0)[0, 3] == pytest.approx(0.05)
 
 
 class TestTrajectoryOfResults:

@@ -11,6 +11,7 @@ import pytest
 
 import scanweld as sw
 from rendered import CAMERA, blind, frame_of, plane_depth, pose_error, rendered
+from scanweld.datasets.synthetic import NOISE_MODELS, degrade_depth
 from scanweld.errors import ConfigError
 from scanweld.geometry import se3
 from scanweld.registration.projective import align_projective
@@ -135,7 +136,7 @@ class TestTracker:
         assert not taken[view.confidences < limit].any()
         result = tracker.track(sw.build_pyramid(sequence.frames[20]), view, true)
         assert result.status.has_pose
-        assert pose_error(result.T_target_source, true)[0] < 5e-3
+        assert pose_error(result.T_target_source, true)[0] < 1e-2  # 1400 points of 11 mm of noise
 
     def test_unstable_surfels_are_left_out_where_half_of_the_view_is_stable(self) -> None:
         mapper = map_of(rendered(count=40), 1)
@@ -235,6 +236,13 @@ class TestTwoFrames:
         assert len(result.unobservable) == 3
         np.testing.assert_allclose(result.T_target_source, guess, atol=1e-3)
 
+    @pytest.mark.parametrize("noise", ["kinect", "realsense"])
+    def test_noisy_wall_is_degenerate(self, noise: str) -> None:
+        depth = plane_depth((0.3, 0.1, 1), 1.5)
+        a, b = (frame_of(degrade_depth(depth, CAMERA, NOISE_MODELS[noise], np.random.default_rng(k))) for k in (1, 2))
+        for guess in (np.eye(4), se3.exp([0, 0.1, 0, 0, 0, 0])):
+            assert sw.align_frames(a, b, T_init=guess).status is sw.Status.DEGENERATE
+
     def test_wrong_guess_never_ends_in_a_wrong_converged(self) -> None:
         rng = np.random.default_rng(2)
         right = 0
@@ -243,14 +251,14 @@ class TestTwoFrames:
             G = sequence.ground_truth.T_world_camera
             true = se3.inverse(G[22]) @ G[20]
             for shift_m, turn_deg in ((0.3, 0), (0.6, 0), (1.0, 0), (0, 15), (0, 45), (0.3, 20)):
-                for _ in range(3):
+                for _ in range(2):
                     guess = random_start(rng, shift_m, turn_deg) @ true
                     result = sw.align_frames(sequence.frames[20], sequence.frames[22], T_init=guess)
                     if result.status is sw.Status.CONVERGED:
                         shift, turn = pose_error(result.T_target_source, true)
                         assert max(shift / 0.01, turn / 0.5) < 1, (scene, noise, shift_m, turn_deg, result)
                         right += 1
-        assert right >= 20
+        assert right >= 15
 
     def test_frames_of_different_cameras(self) -> None:
         sequence = rendered(count=40)

@@ -44,6 +44,7 @@ def test_subset_by_index_mask_and_slice() -> None:
 
 def test_empty_is_allowed() -> None:
     assert Trajectory(np.empty(0), np.empty((0, 4, 4))).path_length_m == 0
+    assert len(Trajectory(np.arange(5.0), poses(5)).subset([])) == 0
 
 
 @pytest.mark.parametrize(

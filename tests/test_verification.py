@@ -7,8 +7,9 @@ import pytest
 
 import scanweld as sw
 from rendered import CAMERA, frame_of, plane_depth, rendered
+from scanweld.datasets.synthetic import NOISE_MODELS, degrade_depth
 from scanweld.geometry import se3
-from scanweld.registration.verification import SAMPLES, check_against_depth
+from scanweld.registration.verification import SAMPLES, check_against_depth, noise_directions
 from scanweld.tracking.two_frames import surface_points
 
 
@@ -87,3 +88,51 @@ def test_true_pose_of_a_rendered_pair_has_no_conflict() -> None:
     result = check_against_depth(*surface_points(a), se3.inverse(G[39]) @ G[0], b.levels[0])
     assert result.agree > 0.8
     assert result.conflict < 0.03
+
+
+class TestNoiseDirections:
+    """A flat wall is flat however noisy its image is; relief is relief although noise lies over it."""
+
+    @staticmethod
+    def free_of(depth_m: np.ndarray, noise: str | None, camera: sw.PinholeCamera = CAMERA) -> np.ndarray:
+        """Free directions between two images of the same surface with noise of their own."""
+        sides = []
+        for seed in (1, 2):
+            model = None if noise is None else NOISE_MODELS[noise]
+            image = depth_m if model is None else degrade_depth(depth_m, camera, model, np.random.default_rng(seed))
+            sides.append(sw.build_pyramid(frame_of(image, camera=camera)))
+        positions, normals = surface_points(sides[0])
+        centroid = positions.mean(axis=1).astype(np.float64)
+        radius = float(np.sqrt(((positions.T - centroid) ** 2).sum(axis=1).mean()))
+        return noise_directions(positions, normals, np.eye(4), sides[1].levels[0], centroid, radius)
+
+    @pytest.mark.parametrize("noise", [None, "kinect", "realsense"])
+    @pytest.mark.parametrize("normal", [(0, 0, 1), (0.3, 0.1, 1)])
+    @pytest.mark.parametrize("distance_m", [1.0, 2.0])
+    def test_wall_leaves_three(self, noise: str | None, normal: tuple[float, ...], distance_m: float) -> None:
+        free = self.free_of(plane_depth(normal, distance_m), noise)
+        assert free.shape == (6, 3)
+        np.testing.assert_allclose(free.T @ free, np.eye(3), atol=1e-9)
+        # Two translations in the wall and the turn about its normal n: the projector onto the span is known.
+        n = np.array(normal) / np.linalg.norm(normal)
+        expected = np.zeros((6, 6))
+        expected[:3, :3] = np.eye(3) - np.outer(n, n)
+        expected[3:, 3:] = np.outer(n, n)
+        np.testing.assert_allclose(free @ free.T, expected, atol=0.1)
+
+    @pytest.mark.parametrize("noise", [None, "kinect", "realsense"])
+    def test_room_leaves_none(self, noise: str | None) -> None:
+        depth = rendered(count=40).frames[0].depth_m
+        assert self.free_of(depth, noise).shape == (6, 0)
+
+    @pytest.mark.parametrize("noise", [None, "kinect"])
+    def test_edge_of_two_walls_leaves_the_slide_along_it(self, noise: str | None) -> None:
+        depth = np.minimum(plane_depth((0.6, 0, 1), 1.5), plane_depth((-0.6, 0, 1), 1.5))
+        free = self.free_of(depth, noise)
+        assert free.shape == (6, 1)
+        assert abs(free[1, 0]) > 0.99
+
+    def test_nothing_to_compare_constrains_nothing(self) -> None:
+        none = np.zeros((3, 0), np.float32)
+        free = noise_directions(none, none, np.eye(4), wall(2.0).levels[0], np.zeros(3), 1.0)
+        np.testing.assert_array_equal(free, np.eye(6))

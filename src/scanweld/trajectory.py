@@ -65,6 +65,8 @@ class Trajectory:
     def subset(self, selection: npt.ArrayLike | slice) -> Trajectory:
         """Return the trajectory of the selected rows."""
         chosen = selection if isinstance(selection, slice) else np.asarray(selection)
+        if not isinstance(chosen, slice) and chosen.size == 0:
+            chosen = chosen.astype(np.intp)  # an empty list is an array of floats
         return Trajectory(self.timestamps_s[chosen], self.T_world_camera[chosen])
 
 
@@ -91,10 +93,10 @@ class FrameResult:
     rmse_m : root mean square point-to-plane distance of the inliers [m]
     loss : mean robust loss of the matched points at the last iteration, in units of the noise (dimensionless)
     num_inliers : matched points with a residual below the robust threshold
-    overlap : matched points over points that project into the frame, 0..1
+    overlap : matched points over all points of the map that were tracked against, 0..1
     num_surfels : size of the map after the frame
     stage_ms : wall time by stage [ms]
-    note : one line for a person when the state is not TRACKING, else ""
+    note : one line for a person when the state is not TRACKING or the status not "converged", else ""
     """
 
     index: int

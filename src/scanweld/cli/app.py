@@ -5,12 +5,13 @@ Exit codes: 0 done; 1 a known error, one line; 2 usage; 3 done, but without a tr
 
 from __future__ import annotations
 
+import functools
 import logging
 import os
 import shutil
 import sys
-from collections.abc import Sequence
-from typing import Annotated
+from collections.abc import Callable, Sequence
+from typing import Annotated, Any
 
 import typer
 
@@ -32,8 +33,24 @@ app = typer.Typer(
     rich_markup_mode="rich" if shutil.get_terminal_size().columns >= PANEL_COLUMNS else None,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
+
+
+def _stoppable(command: Callable[..., int]) -> Callable[..., int]:
+    """Say that Ctrl-C ended a command: Typer turns it into an exit code without a word."""
+
+    @functools.wraps(command)
+    def call(*arguments: Any, **options: Any) -> int:
+        try:
+            return command(*arguments, **options)
+        except KeyboardInterrupt:
+            print("interrupted; nothing was written", file=sys.stderr)
+            return 130
+
+    return call
+
+
 for command in (demo, slam, register, evaluate, render):
-    app.command()(command)
+    app.command()(_stoppable(command))
 
 
 @app.callback(invoke_without_command=True)

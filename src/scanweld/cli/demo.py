@@ -18,6 +18,7 @@ def demo(
         "scanweld-demo"
     ),
     frames: Annotated[int, typer.Option(help="Number of frames.", min=2)] = DEMO_FRAMES,
+    force: Annotated[bool, typer.Option("--force", help="Replace an existing run elsewhere, too.")] = False,
     threads: Annotated[int | None, typer.Option(help="Number of threads. Default: all cores.", min=1)] = None,
     json_output: Annotated[bool, typer.Option("--json", help="Print the metrics as one JSON object.")] = False,
 ) -> int:
@@ -30,7 +31,7 @@ def demo(
     from scanweld.runs.folder import check_writable
     from scanweld.slam.system import SlamConfig
 
-    force = out == Path("scanweld-demo")
+    force = force or out == Path("scanweld-demo")
     check_writable(out, force=force)
     config = RenderConfig(scene="room", noise="kinect", frames=frames)
     # Rendered to files first: the speed that is reported is that of reading and mapping a recording.

@@ -66,7 +66,8 @@ def radial_weight(camera: PinholeCamera) -> Float32:
     """
     u, v = np.arange(camera.width) - camera.cx, np.arange(camera.height) - camera.cy
     squared = u[None, :] ** 2 + v[:, None] ** 2
-    weight: Float32 = np.exp(-squared / squared.max() / (2 * 0.6**2)).astype(np.float32)
+    largest = squared.max() or 1.0  # an image of one pixel
+    weight: Float32 = np.exp(-squared / largest / (2 * 0.6**2)).astype(np.float32)
     weight.flags.writeable = False
     return weight
 

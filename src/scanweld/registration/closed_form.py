@@ -69,7 +69,7 @@ class HornFit:
     @property
     def rank(self) -> int:
         """Number of singular values of W that are not zero."""
-        bound = np.sqrt(self.source_spread * self.target_spread)
+        bound = np.sqrt(self.source_spread) * np.sqrt(self.target_spread)
         return int((self.singular_values > RANK_TOLERANCE * bound).sum())
 
     @property
@@ -187,7 +187,7 @@ def fit_horn(
     W = (w[:, None] * b).T @ a
     scatter_a, scatter_b = (w[:, None] * a).T @ a, (w[:, None] * b).T @ b
     spread_a, spread_b = float(np.trace(scatter_a)), float(np.trace(scatter_b))
-    bound = np.sqrt(spread_a * spread_b)
+    bound = np.sqrt(spread_a) * np.sqrt(spread_b)  # their product may underflow
     U, sigma, Vt = np.linalg.svd(W / bound if bound > 0 else np.zeros_like(W))
     signed = sigma.copy()
     signed[-1] *= np.sign(np.linalg.det(U @ Vt))

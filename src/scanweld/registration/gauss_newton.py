@@ -58,12 +58,17 @@ class Spectrum:
     observable: Bool
 
 
-def spectrum(equations: NormalEquations, min_mean_constraint: float = MIN_MEAN_CONSTRAINT) -> Spectrum:
+def spectrum(
+    equations: NormalEquations, min_mean_constraint: float = MIN_MEAN_CONSTRAINT, held: Float64 | None = None
+) -> Spectrum:
     """Split the motion into directions that the data constrains and directions that it leaves free.
 
     The information is moved to the points' centroid and rotations are measured by the displacement of a point
     at the root mean square radius, so that all eigenvalues have one unit and do not depend on the origin or
     scale.
+
+    Directions that are known to be free for another reason can be `held`: (K, M), orthonormal columns, twists about the
+    centroid with rotations times the radius.
     """
     dimension = len(equations.centroid_m)
     size = len(equations.gradient)
@@ -77,8 +82,15 @@ def spectrum(equations: NormalEquations, min_mean_constraint: float = MIN_MEAN_C
     radius = equations.radius_m if equations.radius_m > 0 else 1.0
     to_origin[:, dimension:] /= radius
     scaled = to_origin.T @ equations.information @ to_origin / max(equations.total_weight, 1e-300)
-    values, vectors = np.linalg.eigh(scaled)
-    return Spectrum(values, to_origin @ vectors, values > min_mean_constraint)
+    if held is None:
+        values, vectors = np.linalg.eigh(scaled)
+        return Spectrum(values, to_origin @ vectors, values > min_mean_constraint)
+    count = held.shape[1]
+    others = np.linalg.svd(held)[0][:, count:]
+    values, vectors = np.linalg.eigh(others.T @ scaled @ others)
+    observable = np.concatenate([np.zeros(count, np.bool_), values > min_mean_constraint])
+    vectors = np.concatenate([held, others @ vectors], axis=1)
+    return Spectrum(np.concatenate([np.zeros(count), values]), to_origin @ vectors, observable)
 
 
 def solve(equations: NormalEquations, parts: Spectrum) -> Float64:

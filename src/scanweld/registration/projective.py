@@ -19,7 +19,7 @@ from scanweld.parallel import run_ranges
 from scanweld.registration import kernels
 from scanweld.registration.gauss_newton import NormalEquations, Spectrum, free_directions, solve, spectrum
 from scanweld.registration.result import FreeDirection, RegistrationResult, Status
-from scanweld.registration.verification import Agreement, check_against_depth
+from scanweld.registration.verification import Agreement, check_against_depth, noise_directions
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -166,51 +166,85 @@ def align_projective(
     minimum that contradicts what the target saw is no answer, however small its residuals are.
     """
     config = config or ProjectiveConfig()
-    T = np.array(T_target_source, dtype=np.float64)
-    coarsest = len(target) - 1
-    history: list[ProjectiveStep] = []
-    parts: Spectrum | None = None
-    converged = False
-    source, directions = positions_m, normals
-    for level in range(coarsest, -1, -1):
-        stride = max(1, -(-positions_m.shape[1] // max(config.min_points, config.max_points >> (2 * level))))
-        source, directions = positions_m[:, ::stride].copy(), normals[:, ::stride].copy()
-        centroid, radius = _centroid_and_radius(
-            se3.transform_points(T, source[:, :: max(1, source.shape[1] // 1000)].T)
-        )
-        gate = config.fine_gate_m * (config.coarse_gate_m / config.fine_gate_m) ** (level / max(coarsest, 1))
-        converged = False
-        for _ in range(config.iterations):
-            step = projective_step(source, directions, T, target[level], gate, config, centroid, radius, level)
-            history.append(step)
-            if step.num_matched < max(6, config.min_points >> (2 * level)):
-                break
-            parts = spectrum(step.equations)
-            xi = solve(step.equations, parts)
-            T = se3.exp(xi) @ T
-            motion = float(np.linalg.norm(xi[:3] + np.cross(xi[3:], centroid)) + radius * np.linalg.norm(xi[3:]))
-            # A coarse level need only hand over a start within its pixel size.
-            if motion < config.step_m * 4**level:
-                converged = True
-                break
-    agreement = check_against_depth(source, directions, T, target[0])
-    last = history[-1]
-    overlap = last.num_matched / max(1, source.shape[1])
-    free = free_directions(last.equations, parts) if parts is not None and last.num_matched >= 6 else ()
-    status, note = _judge(last, overlap, agreement, free, converged, len(history), config)
+    start = np.array(T_target_source, dtype=np.float64)
+    end = _descend(positions_m, normals, target, start, config)
+    num_free = 0 if end.parts is None else int((~end.parts.observable).sum())
+    held = noise_directions(end.positions_m, end.normals, end.T_target_source, target[0], end.centroid_m, end.radius_m)
+    if num_free < held.shape[1] < 6:
+        # Noise has moved what nothing constrains: again from the start, along the other directions only.
+        history = end.history
+        end = _descend(positions_m, normals, target, start, config, held)
+        end.history[:0] = history
+    last = end.history[-1]
+    agreement = check_against_depth(end.positions_m, end.normals, end.T_target_source, target[0])
+    overlap = last.num_matched / max(1, end.positions_m.shape[1])
+    free = free_directions(last.equations, end.parts) if end.parts is not None and last.num_matched >= 6 else ()
+    status, note = _judge(last, overlap, agreement, free, end.converged, len(end.history), config)
     return RegistrationResult(
-        T_target_source=T,
+        T_target_source=end.T_target_source,
         status=status,
         information=last.equations.information,
-        num_iterations=len(history),
+        num_iterations=len(end.history),
         num_inliers=last.num_inliers,
         overlap=overlap,
         rmse_m=last.rmse_m,
         loss=last.loss,
         unobservable=free,
         note=note,
-        history=tuple(history) if keep_history else (),
+        history=tuple(end.history) if keep_history else (),
     )
+
+
+@dataclass(slots=True)
+class _Descent:
+    """Where the iterations ended, and the source points of the finest level."""
+
+    T_target_source: Float64
+    history: list[ProjectiveStep]
+    parts: Spectrum | None
+    converged: bool
+    positions_m: Float32
+    normals: Float32
+    centroid_m: Float64
+    radius_m: float
+
+
+def _descend(
+    positions_m: Float32,
+    normals: Float32,
+    target: Sequence[SurfaceLevel],
+    T_target_source: Float64,
+    config: ProjectiveConfig,
+    held: Float64 | None = None,
+) -> _Descent:
+    """Iterate from the coarsest level to the finest; `held` as in :func:`~.gauss_newton.spectrum`."""
+    coarsest = len(target) - 1
+    end = _Descent(T_target_source, [], None, False, positions_m, normals, np.zeros(3), 1.0)
+    for level in range(coarsest, -1, -1):
+        stride = max(1, -(-positions_m.shape[1] // max(config.min_points, config.max_points >> (2 * level))))
+        end.positions_m, end.normals = positions_m[:, ::stride].copy(), normals[:, ::stride].copy()
+        few = end.positions_m[:, :: max(1, end.positions_m.shape[1] // 1000)]
+        end.centroid_m, end.radius_m = _centroid_and_radius(se3.transform_points(end.T_target_source, few.T))
+        gate = config.fine_gate_m * (config.coarse_gate_m / config.fine_gate_m) ** (level / max(coarsest, 1))
+        end.converged = False
+        for _ in range(config.iterations):
+            step = projective_step(
+                end.positions_m, end.normals, end.T_target_source, target[level], gate, config,
+                end.centroid_m, end.radius_m, level,
+            )  # fmt: skip
+            end.history.append(step)
+            if step.num_matched < max(6, config.min_points >> (2 * level)):
+                break
+            end.parts = spectrum(step.equations, held=held)
+            xi = solve(step.equations, end.parts)
+            end.T_target_source = se3.exp(xi) @ end.T_target_source
+            turn = float(np.linalg.norm(xi[3:]))
+            motion = float(np.linalg.norm(xi[:3] + np.cross(xi[3:], end.centroid_m))) + end.radius_m * turn
+            # A coarse level need only hand over a start within its pixel size.
+            if motion < config.step_m * 4**level:
+                end.converged = True
+                break
+    return end
 
 
 def schedules(config: ProjectiveConfig) -> Iterator[ProjectiveConfig]:

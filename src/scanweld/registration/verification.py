@@ -8,9 +8,16 @@ import numpy as np
 
 from scanweld.arrays import Float32, Float64
 from scanweld.geometry.depth import SurfaceLevel
+from scanweld.registration.gauss_newton import MIN_MEAN_CONSTRAINT
 
 SAMPLES = 6000
 """Points that are compared: a share of 0.5 is known to 1.3 % (two standard deviations)."""
+
+SIGNIFICANCE = 4.0
+"""Standard errors above zero that make a constraint."""
+
+MIN_SHARE = 0.25
+"""A constraint of which both sides see at least this share is not made of noise, however few the points."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +47,67 @@ def check_against_depth(
     wrong minima of the alignment it is mostly 9 % or more, though up to 80 % of the points may lie on a surface: the
     walls of a room agree with themselves in many places (docs/decisions/0003-verification.md).
     """
+    p, n, q = _pairs(positions_m, normals, T_target_source, target)
+    compared = p.shape[1]
+    if compared == 0:
+        return Agreement(0, 0.0, 0.0, 0.0)
+    sigma = 1 / q[6]
+    along = np.abs((q[3:6] * (p - q[:3])).sum(axis=0))
+    gap = q[2] - p[2]
+    agree = (along < 4 * sigma) & (np.abs(gap) < 0.1) & ((n * q[3:6]).sum(axis=0) > 0.5)
+    far = np.maximum(0.05, 6 * sigma)
+    conflict = ~agree & (gap > far)
+    hidden = ~agree & (gap < -far)
+    return Agreement(compared, float(agree.mean()), float(conflict.mean()), float(hidden.mean()))
+
+
+def noise_directions(
+    positions_m: Float32,
+    normals: Float32,
+    T_target_source: Float64,
+    target: SurfaceLevel,
+    centroid_m: Float64,
+    radius_m: float,
+) -> Float64:
+    """Return the motions that nothing but noise constrains: (6, K), orthonormal columns.
+
+    The normals of a noisy wall scatter, and to the normal equations that looks like relief: a blank wall seems to fix
+    all six motions. The noise of the two sides is independent, though, so the products of the slopes that one side
+    sees with those that the other sees average to the relief that is there for both (the method of instrumental
+    variables). A motion is free when its mean product is below the threshold of :func:`~.gauss_newton.spectrum`, or
+    when it is within ``SIGNIFICANCE`` standard errors of zero and far below what the target alone seems to see.
+
+    Parameters
+    ----------
+    positions_m, normals, T_target_source, target : as for :func:`check_against_depth`
+    centroid_m, radius_m : pivot in the target frame and size; columns are twists about it, rotations times the radius
+    """
+    p, n, q = (side.astype(np.float64) for side in _pairs(positions_m, normals, T_target_source, target))
+    # Partners are chosen by their place alone: choosing by the normals would make their noise alike.
+    near = np.abs(q[2] - p[2]) < 0.1
+    p, n, q = p[:, near], n[:, near], q[:, near]
+    if p.shape[1] == 0:
+        return np.eye(6)
+    weights = q[6] ** 2 / (q[6] ** 2).sum()
+    arm = (p.T - centroid_m) / radius_m
+    slopes = np.concatenate([n, np.cross(arm, n.T).T])
+    target_slopes = np.concatenate([q[3:6], np.cross(arm, q[3:6].T).T])
+    product = (slopes * weights) @ target_slopes.T
+    values, vectors = np.linalg.eigh((product + product.T) / 2)
+    seen, seen_by_target = vectors.T @ slopes, vectors.T @ target_slopes
+    error = np.sqrt((seen * seen_by_target - values[:, None]) ** 2 @ weights**2)
+    apparent = seen_by_target**2 @ weights
+    free = (values < MIN_MEAN_CONSTRAINT) | ((values < SIGNIFICANCE * error) & (values < MIN_SHARE * apparent))
+    return np.asarray(vectors[:, free])
+
+
+def _pairs(
+    positions_m: Float32, normals: Float32, T_target_source: Float64, target: SurfaceLevel
+) -> tuple[Float32, Float32, Float32]:
+    """Sample the points that project onto a pixel with a surface.
+
+    Returns the points and normals (3, M), target frame, and the surface (8, M) behind their pixels.
+    """
     stride = max(1, positions_m.shape[1] // SAMPLES)
     rotation, translation = (
         T_target_source[:3, :3].astype(np.float32),
@@ -55,15 +123,4 @@ def check_against_depth(
     p, n = p[:, inside], n[:, inside]
     q = target.surface[v[inside].astype(np.int64), u[inside].astype(np.int64)].T
     valid = q[6] > 0
-    p, n, q = p[:, valid], n[:, valid], q[:, valid]
-    compared = int(valid.sum())
-    if compared == 0:
-        return Agreement(0, 0.0, 0.0, 0.0)
-    sigma = 1 / q[6]
-    along = np.abs((q[3:6] * (p - q[:3])).sum(axis=0))
-    gap = q[2] - p[2]
-    agree = (along < 4 * sigma) & (np.abs(gap) < 0.1) & ((n * q[3:6]).sum(axis=0) > 0.5)
-    far = np.maximum(0.05, 6 * sigma)
-    conflict = ~agree & (gap > far)
-    hidden = ~agree & (gap < -far)
-    return Agreement(compared, float(agree.mean()), float(conflict.mean()), float(hidden.mean()))
+    return p[:, valid], n[:, valid], q[:, valid]

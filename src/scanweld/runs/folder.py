@@ -32,7 +32,7 @@ def check_writable(folder: Path, *, force: bool) -> None:
             raise OutputError(f"{folder}: exists and is not empty; --force replaces it, --out writes elsewhere")
         if not _looks_like_run(folder):
             raise OutputError(f"{folder}: is not a run folder (no run.json), so --force will not replace it")
-    with _created_parent(folder), tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent):
+    with _parents(folder, keep=False), tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent):
         pass
 
 
@@ -47,18 +47,16 @@ def write_folder(folder: Path, *, force: bool) -> Iterator[Path]:
     """
     check_writable(folder, force=force)
     folder = folder.resolve()  # a link keeps pointing at the run
-    with _created_parent(folder):
+    with _parents(folder, keep=True):
         aside = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
-    try:
-        yield aside
-        mask = os.umask(0)
-        os.umask(mask)
-        aside.chmod(0o777 & ~mask)  # temporary folders are private, results are not
-        _put_in_place(aside, folder)
-    except OSError as error:
-        raise OutputError(f"{error.filename or folder}: cannot be written: {error.strerror or error}") from None
-    finally:
-        shutil.rmtree(aside, ignore_errors=True)
+        try:
+            yield aside
+            mask = os.umask(0)
+            os.umask(mask)
+            aside.chmod(0o777 & ~mask)  # temporary folders are private, results are not
+            _put_in_place(aside, folder)
+        finally:
+            shutil.rmtree(aside, ignore_errors=True)
 
 
 def _put_in_place(aside: Path, folder: Path) -> None:
@@ -77,12 +75,22 @@ def _put_in_place(aside: Path, folder: Path) -> None:
 
 
 @contextlib.contextmanager
-def _created_parent(folder: Path) -> Iterator[None]:
+def _parents(folder: Path, *, keep: bool) -> Iterator[None]:
+    """Make the folders above `folder`; those that were made go again on an error, and at the end unless kept."""
+    made = [parent for parent in folder.parents if not parent.exists()]
+    done = False
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         yield
+        done = keep
     except OSError as error:
-        raise OutputError(f"{folder}: cannot be written: {error.strerror or error}; choose another --out") from None
+        where, why = error.filename or folder, error.strerror or error
+        raise OutputError(f"{where}: cannot be written: {why}; choose another --out") from None
+    finally:
+        if not done:
+            with contextlib.suppress(OSError):  # somebody else uses it meanwhile
+                for parent in made:
+                    parent.rmdir()
 
 
 def _looks_like_run(folder: Path) -> bool:

@@ -126,6 +126,8 @@ def run_sequence(
         tally.warn(f"interrupted after {len(slam.results)} of {len(sequence)} frames")
     if not any(result.state in POSED for result in slam.results):
         raise DatasetError(f"{sequence.name}: no frame could be used; the first: {slam.results[0].note}")
+    if len(slam.map) == 0:  # frames at given poses need no surfaces
+        raise DatasetError(f"{sequence.name}: no frame has usable depth, the map is empty; is the depth scale right?")
     metrics, error = summarise(slam, sequence.ground_truth, tally.num_points_input)
     metrics["seconds_total"] = time.perf_counter() - started
     summary = RunSummary(out, metrics, tuple(slam.results), slam.map, interrupted)
@@ -170,6 +172,8 @@ def _process_all(
 
 def _poses_by_frame(sequence: RgbdSequence, poses: Trajectory) -> list[Float64 | None]:
     """Return the given pose of each frame, None where there is none within 0.02 s."""
+    if len(poses) == 0:
+        raise InvalidInputError("poses: the trajectory is empty; give one pose per frame, or none to track")
     times = sequence.timestamps_s
     after = np.clip(np.searchsorted(poses.timestamps_s, times), 1, max(1, len(poses) - 1))
     before = after - 1

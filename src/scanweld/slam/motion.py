@@ -15,6 +15,14 @@ POSED = (FrameState.TRACKING, FrameState.RELOCALISED)
 """States whose pose was measured."""
 
 
+FARTHEST_AHEAD = 4.0
+"""A motion is carried on for at most so many times as long as it was seen: beyond that it is a guess about a guess.
+
+It also bounds the harm of two timestamps that are too near to each other, as recorders write them: 33 ms of motion
+within 0.5 ms would be carried on a hundredfold.
+"""
+
+
 class ConstantVelocity:
     """Predicts that the camera goes on as it last moved; without measurements it slows down and stops."""
 
@@ -23,13 +31,14 @@ class ConstantVelocity:
         self._T_world_camera: Float64 = np.eye(4)
         self._timestamp_s: float | None = None
         self._velocity: Float64 = np.zeros(6)  # twist per second, in the camera's own frame
+        self._seen_for_s = 0.0  # how long the motion was that the velocity comes from
         self._measured: tuple[float, Float64] | None = None  # when and where the camera was last seen
 
     def predict(self, timestamp_s: float) -> Float64:
         """Return T_world_camera (4, 4) at a time."""
         if self._timestamp_s is None:
             return self._T_world_camera.copy()
-        elapsed = timestamp_s - self._timestamp_s
+        elapsed = min(timestamp_s - self._timestamp_s, FARTHEST_AHEAD * self._seen_for_s)
         return np.asarray(self._T_world_camera @ se3.exp(self._velocity * elapsed))
 
     def observe(self, timestamp_s: float, T_world_camera: Float64) -> None:
@@ -37,7 +46,8 @@ class ConstantVelocity:
         if self._measured is not None and timestamp_s > self._measured[0]:
             # From measurement to measurement: what misses were guessed in between is no motion of the camera.
             step = se3.inverse(self._measured[1]) @ T_world_camera
-            self._velocity = se3.log(step) / (timestamp_s - self._measured[0])
+            self._seen_for_s = timestamp_s - self._measured[0]
+            self._velocity = se3.log(step) / self._seen_for_s
         self._measured = timestamp_s, T_world_camera
         self._T_world_camera, self._timestamp_s = T_world_camera, timestamp_s
 

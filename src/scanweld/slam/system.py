@@ -21,7 +21,7 @@ from scanweld.loop_closure.loop_closer import NoLoopCloser
 from scanweld.mapping.fusion import FusionConfig
 from scanweld.mapping.mapper import SurfelMapper
 from scanweld.registration.result import RegistrationResult
-from scanweld.slam.motion import ConstantVelocity, trajectory_of
+from scanweld.slam.motion import POSED, ConstantVelocity, trajectory_of
 from scanweld.tracking.tracker import FrameToModelTracker, TrackingConfig
 from scanweld.trajectory import FrameResult, FrameState, Trajectory
 
@@ -97,7 +97,7 @@ class Slam:
         self.surfaces = surfaces or SurfaceConfig()
         self.results: list[FrameResult] = []
         self._motion = ConstantVelocity()
-        self._T_world_first = np.eye(4) if T_world_first is None else as_transform(T_world_first, "T_world_first")
+        self._T_world_first = _near_pose(np.eye(4) if T_world_first is None else T_world_first, "T_world_first")
 
     @property
     def map(self) -> Any:
@@ -120,7 +120,7 @@ class Slam:
         clock = _Stopwatch()
         self._check_time(frame.timestamp_s)
         if T_world_camera is not None:
-            T_world_camera = as_transform(T_world_camera, "T_world_camera")
+            T_world_camera = _near_pose(T_world_camera, "T_world_camera")
         pyramid = build_pyramid(frame, self.surfaces)
         clock.lap("surfaces")
         predicted = self._motion.predict(frame.timestamp_s) if T_world_camera is None else T_world_camera
@@ -129,7 +129,7 @@ class Slam:
         if T_world_camera is not None:
             result = self._placed(frame, T_world_camera)
         elif len(self.mapper.map) == 0:
-            result = self._first(pyramid)
+            result = self._first(pyramid, predicted)
         else:
             result = self._judged(frame, predicted, self.tracker.track(pyramid, view, predicted))
         clock.lap("track")
@@ -157,11 +157,13 @@ class Slam:
             )
         )
 
-    def _first(self, pyramid: SurfacePyramid) -> FrameResult:
+    def _first(self, pyramid: SurfacePyramid, predicted: Float64) -> FrameResult:
         """Start the map, unless there is nothing to start it with."""
         seen = int(np.count_nonzero(pyramid.levels[0].surface[..., 6]))
         share = seen / pyramid.levels[0].depth_m.size
-        start = self._placed(pyramid.frame, self._T_world_first)
+        # Frames at given poses may have left the map empty: the world is theirs then.
+        begun = any(result.state in POSED for result in self.results)
+        start = self._placed(pyramid.frame, predicted if begun else self._T_world_first)
         if share < MIN_FIRST_SHARE:
             return replace(
                 start, state=FrameState.LOST, note=f"no map yet, and only {share:.1%} of the depth is usable"
@@ -206,6 +208,20 @@ class Slam:
     def _keep(self, result: FrameResult) -> FrameResult:
         self.results.append(result)
         return result
+
+
+FARTHEST_M = 1e4
+"""Largest coordinate of a given pose [m]: maps are float32, which has steps of 1 mm there."""
+
+
+def _near_pose(transform: npt.ArrayLike, name: str) -> Float64:
+    T = as_transform(transform, name)
+    if np.abs(T[:3, 3]).max() > FARTHEST_M:
+        raise InvalidInputError(
+            f"{name}: {np.abs(T[:3, 3]).max():.0f} m from the origin, expected at most {FARTHEST_M:.0f} m, where a "
+            "float32 map begins to lose millimetres; subtract an offset from all poses"
+        )
+    return T
 
 
 MIN_FIRST_SHARE = 0.02

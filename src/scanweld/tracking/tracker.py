@@ -12,7 +12,7 @@ from scanweld.geometry import se3
 from scanweld.geometry.depth import SurfacePyramid
 from scanweld.geometry.views import ModelView
 from scanweld.registration.projective import ProjectiveConfig, align_projective, schedules
-from scanweld.registration.result import RegistrationResult
+from scanweld.registration.result import RegistrationResult, Status
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -25,9 +25,10 @@ class TrackingConfig:
         low=0.001,
         high=1.0,
     )
-    # Looser than for unknown motions: the prediction is close, and somebody may walk through a third of the view.
+    # Looser than for unknown motions: the prediction is close. Unrelated views that look alike have 14 % of conflict
+    # and more (docs/decisions/0003-verification.md).
     projective: ProjectiveConfig = section(
-        lambda: ProjectiveConfig(min_agreement=0.4, max_conflict=0.35), "schedule and gates of the alignment"
+        lambda: ProjectiveConfig(min_agreement=0.5, max_conflict=0.12), "schedule and gates of the alignment"
     )
 
     def __post_init__(self) -> None:
@@ -55,18 +56,19 @@ class FrameToModelTracker:
 
         Returns
         -------
-        The result of moving the camera: T_target_source is T_world_camera.
+        The result of moving the camera: T_target_source is T_world_camera, and `information` belongs to a left
+        perturbation of it, in world axes. Free directions are named in the camera's axes.
         """
         positions, normals = self._select(view)
         T_camera_world = se3.inverse(T_world_camera)
-        best: RegistrationResult | None = None
-        for schedule in schedules(self.config.projective):
-            result = align_projective(positions, normals, pyramid.levels, T_camera_world, schedule)
-            if best is None or result.status.rank > best.status.rank:
-                best = result
-            if best.status.has_pose:
-                break
-        assert best is not None  # there is at least one schedule
+        first, *wider = schedules(self.config.projective)
+        best = align_projective(positions, normals, pyramid.levels, T_camera_world, first)
+        if not best.status.has_pose:
+            for schedule in wider:
+                result = align_projective(positions, normals, pyramid.levels, T_camera_world, schedule)
+                if result.status is Status.CONVERGED:  # after a wide search nothing less is worth a pose
+                    best = result
+                    break
         # The aligner moves the map to the camera: T_cw <- exp(xi) T_cw. With T_wc <- exp(eta) T_wc, xi = -Ad(T_cw) eta.
         adjoint = se3.adjoint(best.T_target_source)
         return replace(

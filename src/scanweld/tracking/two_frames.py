@@ -23,7 +23,7 @@ class TwoFrameConfig:
 
     surfaces: SurfaceConfig = section(SurfaceConfig, "how depth becomes surfaces")
     projective: ProjectiveConfig = section(
-        lambda: ProjectiveConfig(iterations=40, min_cosine=0.8),
+        lambda: ProjectiveConfig(iterations=40, min_cosine=0.8, min_overlap=0.3),
         "schedule and gates of the alignment",
     )
 
