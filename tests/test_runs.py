@@ -17,6 +17,7 @@ import scanweld as sw
 from rendered import CAMERA, MemorySequence, blind, rendered
 from scanweld.config import load_toml
 from scanweld.runs import output
+from scanweld.mapping.rendering import BACKGROUND
 from scanweld.runs.folder import check_writable, next_run_folder, write_folder
 from scanweld.runs.run import RunSummary, summarise
 
@@ -137,12 +138,12 @@ class TestFolder:
             image = cv2.imread(str(path))
             assert image.shape[1] / image.shape[0] == CAMERA.width / CAMERA.height
             assert image.shape[1] >= CAMERA.width
-            filled = (image != 255).any(axis=2).mean()
+            filled = (image != BACKGROUND).any(axis=2).mean()
             assert filled > (0.15 if "overview" in path.name else 0.8), path.name
         # The first view is from the second tenth of the path: it looks like the frame that was taken there.
         seen = cv2.imread(str(folder / "renders/view-1-rgb.png"))[..., ::-1]
         seen = cv2.resize(seen, (CAMERA.width, CAMERA.height), interpolation=cv2.INTER_AREA)
-        drawn = (seen != 255).any(axis=2)
+        drawn = (seen != BACKGROUND).any(axis=2)
         a, b = (cv2.blur(image, (3, 3))[drawn].astype(float) for image in (seen, troubled().frames[1].color))
         shifted = np.roll(cv2.blur(seen, (3, 3)), 8, axis=1)[drawn].astype(float)
         assert np.corrcoef(a.ravel(), b.ravel())[0, 1] > 0.85

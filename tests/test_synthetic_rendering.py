@@ -264,7 +264,7 @@ def test_an_existing_folder_is_kept_without_force(tmp_path: Path) -> None:
     (target / "notes.txt").write_text("mine")
     with pytest.raises(OutputError, match="--force"):
         render_sequence(target, config)
-    with pytest.raises(OutputError, match="not replaced"):
+    with pytest.raises(OutputError, match="will not replace"):
         render_sequence(target, config, force=True)
     assert (target / "notes.txt").read_text() == "mine"
     (target / "notes.txt").unlink()

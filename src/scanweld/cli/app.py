@@ -80,7 +80,7 @@ def run(arguments: Sequence[str]) -> int:
         return 130
     except BrokenPipeError:  # the reader of a pipe has gone: no more to say, and no traceback at exit
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 1
+        return 0
     except Exception as error:
         # Usage errors of the parser carry their exit code and know how to show themselves.
         show = getattr(error, "show", None)

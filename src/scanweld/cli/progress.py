@@ -29,7 +29,7 @@ class FrameProgress:
 
     def __enter__(self) -> FrameProgress:
         columns = (
-            TextColumn("[bold]{task.description}"), BarColumn(bar_width=None), MofNCompleteColumn(),
+            TextColumn("[bold]{task.description}"), MofNCompleteColumn(), BarColumn(bar_width=None),
             TextColumn("{task.fields[detail]}"), TimeRemainingColumn(),
         )  # fmt: skip
         self._bar = Progress(*columns, console=self._console, transient=True, disable=not self._live)

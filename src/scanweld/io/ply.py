@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import os
-import tempfile
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -14,6 +13,7 @@ import plyfile
 from scanweld.arrays import Array, UInt8
 from scanweld.errors import FileFormatError, OutputError
 from scanweld.geometry.point_cloud import PointCloud
+from scanweld.io.atomic import write_file
 
 logger = logging.getLogger(__name__)
 
@@ -61,24 +61,7 @@ def write_ply(path: str | os.PathLike[str], thing: HasColumns) -> None:
         table[name] = values
     lines = ["ply", "format binary_little_endian 1.0", "comment scanweld, metres", f"element vertex {count}"]
     lines += [f"property {_NAMES[kind[1:]]} {name}" for name, kind in fields]
-    _replace(Path(path), "\n".join([*lines, "end_header", ""]).encode("ascii") + table.tobytes())
-
-
-def _replace(path: Path, content: bytes) -> None:
-    """Write aside and rename, so that nobody ever sees half a file."""
-    temporary = None
-    try:
-        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", delete=False) as file:
-            temporary = Path(file.name)
-            file.write(content)
-        mask = os.umask(0)
-        os.umask(mask)
-        temporary.chmod(0o666 & ~mask)  # temporary files are private, results are not
-        temporary.replace(path)
-    except OSError as error:
-        if temporary is not None:
-            temporary.unlink(missing_ok=True)
-        raise OutputError(f"{path}: cannot be written: {error.strerror or error}") from None
+    write_file(Path(path), "\n".join([*lines, "end_header", ""]).encode("ascii") + table.tobytes())
 
 
 def read_ply(path: str | os.PathLike[str]) -> PointCloud:

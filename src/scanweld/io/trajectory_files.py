@@ -14,7 +14,6 @@ T = F T_file F with F = diag(1, -1, 1, 1). Files named `*.gt.freiburg` and `*.gt
 
 from __future__ import annotations
 
-import contextlib
 import gzip
 import io
 import os
@@ -26,8 +25,9 @@ import numpy as np
 import numpy.typing as npt
 
 from scanweld.arrays import Float64
-from scanweld.errors import FileFormatError, InvalidInputError, OutputError
+from scanweld.errors import FileFormatError, InvalidInputError
 from scanweld.geometry import se3
+from scanweld.io.atomic import write_file
 from scanweld.trajectory import Trajectory
 
 FRAMES_PER_SECOND = 30.0
@@ -145,14 +145,7 @@ def _write(path: Path, text: str) -> None:
     data = text.encode("ascii")
     if path.suffix == ".gz":
         data = gzip.compress(data, mtime=0)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        temporary.write_bytes(data)
-        os.replace(temporary, path)
-    except OSError as error:
-        with contextlib.suppress(OSError):
-            temporary.unlink()
-        raise OutputError(f"{path}: cannot be written: {error.strerror or error}") from None
+    write_file(path, data)
 
 
 def _read_text(path: Path) -> str:

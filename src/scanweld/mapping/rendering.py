@@ -126,6 +126,10 @@ def render_model_view(
     return ModelView(T_world_camera, camera, positions, normals, confidences, index_map, stable_confidence)
 
 
+BACKGROUND = 216
+"""Grey of a picture where nothing was mapped: white objects stand out from it, and so do black ones."""
+
+
 @dataclass(frozen=True, slots=True)
 class Picture:
     """The map as a person sees it: depth (H, W) float32 [m], inf where empty; color (H, W, 3) uint8; normals
@@ -135,7 +139,7 @@ class Picture:
     color: UInt8
     normals: Float32
 
-    def normal_colors(self, T_world_camera: Float64, background: int = 255) -> UInt8:
+    def normal_colors(self, T_world_camera: Float64, background: int = BACKGROUND) -> UInt8:
         """Normals in the camera frame as colours (H, W, 3): x, -y, -z from -1..1 to 0..255."""
         seen = np.isfinite(self.depth_m)
         in_camera = self.normals @ T_world_camera[:3, :3].astype(np.float32)
@@ -150,7 +154,7 @@ def render_picture(
     camera: PinholeCamera,
     *,
     min_confidence: float = 0.0,
-    background: int = 255,
+    background: int = BACKGROUND,
 ) -> Picture:
     """Draw the surfels as discs, nearest on top."""
     candidates = find_candidates(surfels, T_world_camera, camera)

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
-import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +13,7 @@ from scanweld.arrays import Array
 from scanweld.datasets.synthetic.sequence import DEPTH_SCALE, RenderConfig, SyntheticSequence
 from scanweld.errors import OutputError
 from scanweld.geometry.camera import PinholeCamera
+from scanweld.io.atomic import write_folder
 from scanweld.io.trajectory_files import write_tum
 
 _PNG_COMPRESSION = 1  # fast; renders compress well anyway
@@ -45,24 +44,12 @@ def render_sequence(
     OutputError
         When the folder holds something and `force` is not given, or it cannot be written.
     """
-    target = Path(folder)
-    _refuse_to_overwrite(target, force)
     sequence = SyntheticSequence(config)
-    with _written_aside(target) as aside:
+    with write_folder(Path(folder), force=force, kind="rendered sequence", mark="associations.txt") as aside:
         _write_frames(aside, sequence, progress)
         write_tum(aside / "groundtruth.txt", sequence.ground_truth)
         _write_camera(aside / "camera.json", sequence.camera)
     return sequence
-
-
-def _refuse_to_overwrite(target: Path, force: bool) -> None:
-    if target.exists() and not target.is_dir():
-        raise OutputError(f"{target}: exists and is no folder")
-    if target.is_dir() and any(target.iterdir()):
-        if not force:
-            raise OutputError(f"{target}: exists and is not empty; --force replaces it")
-        if not (target / "rgb.txt").is_file() or not (target / "depth.txt").is_file():
-            raise OutputError(f"{target}: holds something else than a sequence; it is not replaced")
 
 
 def _write_frames(folder: Path, sequence: SyntheticSequence, progress: Callable[[int, int], None] | None) -> None:
@@ -100,23 +87,3 @@ def _write_camera(path: Path, camera: PinholeCamera) -> None:
         "width": camera.width, "height": camera.height, "depth_scale": DEPTH_SCALE,
     }  # fmt: skip
     path.write_text(json.dumps(values, indent=2) + "\n", encoding="ascii")
-
-
-@contextlib.contextmanager
-def _written_aside(target: Path) -> Iterator[Path]:
-    """Give a new folder beside `target` that takes its place at the end, or vanishes on an error."""
-    place = target.absolute()
-    aside = place.with_name(f".{place.name}.{os.getpid()}.tmp")
-    replaced = place.with_name(f".{place.name}.{os.getpid()}.old")
-    try:
-        aside.parent.mkdir(parents=True, exist_ok=True)
-        aside.mkdir()
-        yield aside
-        if target.is_dir():  # the old one goes away only once the new one is in its place
-            os.replace(target, replaced)
-        os.replace(aside, target)
-    except OSError as error:
-        raise OutputError(f"{target}: cannot be written: {error.strerror or error}") from None
-    finally:
-        shutil.rmtree(aside, ignore_errors=True)
-        shutil.rmtree(replaced, ignore_errors=True)

@@ -1,0 +1,119 @@
+"""Files and folders that appear complete or not at all: written aside, then renamed."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+from scanweld.errors import OutputError
+
+
+def write_file(path: Path, content: bytes) -> None:
+    """Write a file, or replace one.
+
+    Raises
+    ------
+    OutputError
+        When it cannot be written; what was there before is still there.
+    """
+    temporary = None
+    try:
+        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", delete=False) as file:
+            temporary = Path(file.name)
+            file.write(content)
+        temporary.chmod(0o666 & ~_umask())  # temporary files are private, results are not
+        temporary.replace(path)
+    except OSError as error:
+        if temporary is not None:
+            temporary.unlink(missing_ok=True)
+        raise OutputError(f"{path}: cannot be written: {error.strerror or error}") from None
+
+
+def check_writable(folder: Path, *, force: bool, kind: str, mark: str) -> None:
+    """Raise OutputError before any work is done when `folder` could not be written at the end.
+
+    Parameters
+    ----------
+    folder : what :func:`write_folder` will make
+    force : whether one that holds something may be replaced
+    kind, mark : only a folder of this kind is ever replaced, which is one that holds the file `mark`
+    """
+    if folder.exists() and not folder.is_dir():
+        raise OutputError(f"{folder}: exists and is a file; choose another --out")
+    folder = folder.resolve()
+    if Path.cwd().is_relative_to(folder):
+        raise OutputError(f"{folder}: is or holds the current folder; choose another --out")
+    if folder.is_dir() and any(folder.iterdir()):
+        if not force:
+            raise OutputError(f"{folder}: exists and is not empty; --force replaces it, --out writes elsewhere")
+        if not (folder / mark).is_file():
+            raise OutputError(f"{folder}: is not a {kind} (no {mark}), so --force will not replace it")
+    with _parents(folder, keep=False), tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent):
+        pass
+
+
+@contextlib.contextmanager
+def write_folder(folder: Path, *, force: bool, kind: str, mark: str) -> Iterator[Path]:
+    """Yield an empty folder beside `folder`; at the end it takes its place, on an error it vanishes.
+
+    Parameters are those of :func:`check_writable`.
+
+    Raises
+    ------
+    OutputError
+        When the folder cannot be written, or exists and must not be replaced.
+    """
+    check_writable(folder, force=force, kind=kind, mark=mark)
+    folder = folder.resolve()  # a link keeps pointing at the result
+    with _parents(folder, keep=True):
+        aside = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+        try:
+            yield aside
+            aside.chmod(0o777 & ~_umask())
+            _put_in_place(aside, folder)
+        finally:
+            shutil.rmtree(aside, ignore_errors=True)
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
+
+
+def _put_in_place(aside: Path, folder: Path) -> None:
+    """Rename `aside` to `folder`; what was there goes away only once the new one is in its place."""
+    if not folder.exists():
+        aside.rename(folder)
+        return
+    old = aside.with_name(aside.name + ".old")
+    folder.rename(old)
+    try:
+        aside.rename(folder)
+    except OSError:
+        old.rename(folder)
+        raise
+    shutil.rmtree(old, ignore_errors=True)
+
+
+@contextlib.contextmanager
+def _parents(folder: Path, *, keep: bool) -> Iterator[None]:
+    """Make the folders above `folder`; those that were made go again on an error, and at the end unless kept."""
+    made = [parent for parent in folder.parents if not parent.exists()]
+    done = False
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        yield
+        done = keep
+    except OSError as error:
+        where, why = error.filename or folder, error.strerror or error
+        raise OutputError(f"{where}: cannot be written: {why}; choose another --out") from None
+    finally:
+        if not done:
+            with contextlib.suppress(OSError):  # somebody else uses it meanwhile
+                for parent in made:
+                    parent.rmdir()
