@@ -77,7 +77,10 @@ def test_one_pose_has_an_ate_but_no_rpe(tmp_path: Path, capsys: pytest.CaptureFi
     assert run(["evaluate", path, path, "--json", "--plot", str(tmp_path / "p.png")]) == 0
     assert json.loads(capsys.readouterr().out)["rpe_trans_m"] is None
     assert run(["evaluate", path, path]) == 0
-    assert "one matched pose" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "matched poses    1 of 1" in out
+    assert "RPE translation  -\n" in out
+    assert out.endswith("RPE rotation     -\n")
 
 
 def test_formats_mix(files: tuple[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 import struct
 import zlib
+from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
@@ -14,7 +16,10 @@ from hypothesis import strategies as st
 
 from scanweld.datasets.images import (
     SURFACE_BAND,
+    _on_surface,
     check_depth_unit,
+    compare_depth_units,
+    explain_unusable_depth,
     read_color,
     read_depth_png,
     read_header,
@@ -255,6 +260,26 @@ def test_a_block_takes_the_majority_and_of_equals_the_nearer() -> None:
     np.testing.assert_array_equal(resize_depth(blocks, (1, 4)), np.array([[3, 1, 5, 2]], np.float32))
 
 
+def test_a_much_smaller_image_costs_a_bounded_number_of_samples(monkeypatch: pytest.MonkeyPatch) -> None:
+    """16 x 16 pixels an output pixel, of which 8 x 8 are looked at: all of them would make 65536 comparisons."""
+    compared = 0
+
+    def counted(samples: list[np.ndarray], surface: np.ndarray) -> Iterator[np.ndarray]:
+        nonlocal compared
+        for same in _on_surface(samples, surface):
+            compared += 1
+            yield same
+
+    monkeypatch.setattr("scanweld.datasets.images._on_surface", counted)
+    small = CAMERA.scaled(1 / 16)
+    plane = plane_depth(CAMERA, (0.3, -0.2, 1), 2)
+    resized = resize_depth(plane, small.shape)
+    assert compared == 64 * 64 + 64
+    # The samples are the odd pixels of the 16, half a pixel off the centre on either axis at most.
+    expected = plane_depth(small, (0.3, -0.2, 1), 2)
+    assert (np.abs(resized - expected) <= 1.01 * expected**2 * 0.5 * 0.5 / (2 * 520)).all()
+
+
 def test_within_the_band_inverse_depth_is_averaged() -> None:
     """1 and 1.01 are one surface (band 2 %), 1.1 is not: 2 / (1 / 1 + 1 / 1.01) = 1.004975."""
     assert SURFACE_BAND == 0.02
@@ -300,6 +325,29 @@ def test_tum_depth_read_as_millimetres_is_doubted() -> None:
     message = check_depth_unit(7.0, 1000)
     assert message is not None
     assert "--depth-scale 5000" in message
+
+
+@pytest.mark.parametrize(
+    ("median_m", "scale", "words"),
+    [
+        (1500, 1, "the unit is likely 1 mm .* --depth-scale 1000"),
+        (5.2, 1000, "5.2 m with 1000 .* 0.3 to 3 m are used; widen the range, or, if .* --depth-scale 5000"),
+        (0.2, 1e-6, "widen the range$"),
+        (1.5, 1000, "the unit looks right"),
+        (0, 1000, "no valid depth"),
+    ],
+)
+def test_depth_that_gave_no_surface_is_explained(median_m: float, scale: float, words: str) -> None:
+    """5.2 m is 5200 units, 1.04 m at 5000 per metre; 0.2 m at 1e-6 is 2e-7 units, no distance in any unit."""
+    assert re.search(words, explain_unusable_depth(median_m, scale, (0.3, 3.0)))
+
+
+def test_units_that_a_picture_does_not_betray_are_compared() -> None:
+    """TUM and Redwood differ by 5; a factor of 1000 shows in the depth itself."""
+    assert "5 times smaller" in (compare_depth_units(1000, 5000, "the format") or "")
+    assert "5 times larger" in (compare_depth_units(5000, 1000, "the format") or "")
+    for passed in (1000, 1400, 1, 1e6):
+        assert compare_depth_units(1000, passed, "the format") is None
 
 
 def test_no_valid_depth_and_hopeless_units_say_so() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -30,7 +31,7 @@ from written_sequences import (
 
 def test_every_kind_of_sequence_satisfies_the_protocol(tmp_path: Path) -> None:
     sequence = open_sequence(write_redwood(tmp_path))
-    for kind in (sequence, select(sequence, "1:"), open_sequence(tmp_path, scale=0.5)):
+    for kind in (sequence, select(sequence, "1:"), open_sequence(tmp_path, scale=2)):
         assert isinstance(kind, RgbdSequence)
 
 
@@ -113,7 +114,7 @@ def test_negative_fy_is_taken_as_positive(tmp_path: Path) -> None:
 def test_camera_is_that_of_the_images_on_disk(tmp_path: Path) -> None:
     write_redwood(tmp_path)
     camera = PinholeCamera(12, 12, 7, 5, WIDTH, HEIGHT)
-    assert open_sequence(tmp_path, camera=camera, scale=0.5).camera == camera.scaled(0.5)
+    assert open_sequence(tmp_path, camera=camera, scale=2).camera == camera.scaled(2)
     with pytest.raises(DatasetError, match=r"the images are 16x12, the camera 8x6"):
         open_sequence(tmp_path, camera=camera.scaled(0.5))
 
@@ -146,8 +147,63 @@ def test_camera_file_that_is_no_camera(tmp_path: Path, text: str) -> None:
 
 
 def test_depth_scale_is_checked(tmp_path: Path) -> None:
-    with pytest.raises(DatasetError, match="--depth-scale: depth_scale must be positive"):
+    with pytest.raises(DatasetError, match=r"^depth_scale must be positive"):
         open_sequence(write_redwood(tmp_path), depth_scale=-1)
+
+
+@pytest.mark.parametrize(
+    ("stated", "passed", "words"),
+    [
+        (None, 5000, "the unit of the format is 1000 per metre, 5000 was passed: the scene becomes 5 times smaller"),
+        (None, 200, "the unit of the format is 1000 per metre, 200 was passed: the scene becomes 5 times larger"),
+        (5000, 1000, "the unit of camera.json is 5000 per metre, 1000 was passed: the scene becomes 5 times larger"),
+        (5000, 5000, None),
+        (None, 1001, None),
+    ],
+)
+def test_a_unit_that_contradicts_the_sequence_is_told_once(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, stated: float | None, passed: float, words: str | None
+) -> None:
+    write_redwood(tmp_path)
+    if stated is not None:
+        write_camera(tmp_path, depth_scale=stated)
+    assert open_sequence(tmp_path, depth_scale=passed).depth_scale == passed
+    told = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
+    assert told == ([] if words is None else [f"depth_scale: {words}"])
+
+
+@pytest.mark.parametrize(
+    ("camera", "words"),
+    [
+        ((13, 13, 319.5, 5), "the principal point 319.5, 5 lies outside the image; the images are 16x12"),
+        ((13, 13, 7, -9), "the principal point 7, -9 lies outside"),
+        ((525, 13, 7, 5), "fx = 525 is 32.8 times the image width"),
+        ((13, 1, 7, 5), "fy = 1 is 0.0625 times the image width"),
+        ((525, 525, 319.5, 239.5), "principal point 319.5, 239.5 .* and fx = 525 .* and fy = 525"),
+    ],
+)
+def test_a_camera_that_does_not_fit_the_images_is_doubted_once(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, camera: tuple[float, float, float, float], words: str
+) -> None:
+    open_sequence(write_redwood(tmp_path), camera=camera)
+    told = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
+    assert len(told) == 1
+    assert told[0].startswith("camera: ")
+    assert re.search(words, told[0])
+
+
+def test_plausible_cameras_are_not_doubted(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """0.2 and 5 times the 16 pixels, and a principal point in the corner pixels."""
+    write_redwood(tmp_path)
+    for camera in ((3.2, 80, 0, 0), (13, 13, 15, 11)):
+        open_sequence(tmp_path, camera=camera)
+    open_sequence(tmp_path)
+    assert caplog.text == ""
+
+
+def test_a_bad_camera_is_told_without_stammering(tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match=r"^camera: focal lengths must be positive, got -3"):
+        open_sequence(write_redwood(tmp_path), camera=(-3, 3, 7, 5))
 
 
 def test_parse_intrinsics() -> None:
@@ -207,15 +263,36 @@ def test_frames_that_select_nothing(tmp_path: Path, frames: str, words: str) -> 
 
 def test_half_size(tmp_path: Path) -> None:
     """Golden 9: cx' = (cx + 0.5) / 2 - 0.5; a 2x2 block becomes its mean (inverse) depth and colour."""
-    full, half = open_sequence(write_redwood(tmp_path, suffix=".png")), open_sequence(tmp_path, scale=0.5)
+    write_large(tmp_path, 96, 64)
+    full, half = open_sequence(tmp_path), open_sequence(tmp_path, scale=0.5)
     assert half.camera == full.camera.scaled(0.5)
-    assert (half.camera.width, half.camera.height) == (8, 6)
-    frame, small = full.read(2), half.read(2)
+    assert (half.camera.width, half.camera.height) == (48, 32)
+    frame, small = full.read(0), half.read(0)
     assert small.camera == half.camera
     assert small.timestamp_s == frame.timestamp_s
     block = frame.depth_m[:2, :2].astype(np.float64)
     np.testing.assert_allclose(small.depth_m[0, 0], 4 / (1 / block).sum(), rtol=1e-6)
-    np.testing.assert_array_equal(small.color, color_rgb(2)[:6, :8])
+    np.testing.assert_array_equal(small.color, np.full((32, 48, 3), (200, 100, 0)))
+
+
+@pytest.mark.parametrize("scale", [0.01, 0.49, 0.0001])
+def test_a_scale_that_leaves_too_few_pixels_is_refused(tmp_path: Path, scale: float) -> None:
+    write_large(tmp_path, 96, 64)
+    with pytest.raises(InvalidInputError, match=r"^scale: .*96x64.*less than 32 pixels.*use 0[.]5 or more$"):
+        open_sequence(tmp_path, scale=scale)
+
+
+def test_images_that_are_small_already_cannot_be_made_smaller(tmp_path: Path) -> None:
+    with pytest.raises(InvalidInputError, match=r"16x12 images 14x11.*cannot be made smaller"):
+        open_sequence(write_redwood(tmp_path), scale=0.9)
+    assert open_sequence(tmp_path, scale=1.5).camera.shape == (18, 24)
+
+
+def write_large(folder: Path, width: int, height: int) -> None:
+    """One frame in the Redwood layout: depth 1.5 m and up by a millimetre a pixel, one colour."""
+    depth = 1500 + np.add.outer(np.arange(height), np.arange(width))
+    write_image(folder / "depth/0.png", depth.astype(np.uint16))
+    write_image(folder / "color/0.png", np.full((height, width, 3), (200, 100, 0), np.uint8))
 
 
 # --- bad input: one line that names the place and the fix -----------------------------------------
@@ -253,13 +330,40 @@ def test_unknown_format_names_the_known(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["redwood", "7scenes", "tum", "icl"])
 def test_a_named_format_says_what_it_misses(tmp_path: Path, name: str) -> None:
-    fails(tmp_path, "empty|without depth|no depth", format=name)
+    layout = next(row.layout for row in FORMATS if row.name == name)
+    fails(tmp_path, f"format '{name}', which needs {re.escape(layout)}; it holds nothing", format=name)
+
+
+@pytest.mark.parametrize("name", ["redwood", "7scenes", "tum", "icl"])
+def test_a_named_format_that_does_not_fit_is_refused_and_the_right_one_named(tmp_path: Path, name: str) -> None:
+    """Read as another format a sequence would get that format's intrinsics, unit and truth."""
+    write_redwood(tmp_path / "redwood", color="image")
+    write_seven_scenes(tmp_path / "7scenes")
+    write_tum(tmp_path / "tum")
+    (tmp_path / "tum/rgb").rename(tmp_path / "tum/pictures")  # with rgb/ it could be called ICL-NUIM
+    for folder in {"redwood", "7scenes", "tum"} - {name}:
+        words = f"not a sequence of format '{name}', which needs .*looks like '{folder}'"
+        fails(tmp_path / folder, words, format=name)
+
+
+def test_a_named_format_wins_where_its_files_suffice(tmp_path: Path) -> None:
+    """ICL-NUIM's archives without their truth have the files of TUM; numbered rgb/ and depth/ those of Redwood."""
+    sequence = open_sequence(write_tum(tmp_path / "t"), format="icl")
+    assert sequence.camera.fx == pytest.approx(481.2 / 40)
+    numbered = write_redwood(tmp_path / "r", color="rgb", suffix=".png")
+    assert open_sequence(numbered, format="icl").depth_scale == 5000
+    assert open_sequence(numbered, format="redwood").depth_scale == 1000
 
 
 def test_empty_sequence(tmp_path: Path) -> None:
     (tmp_path / "color").mkdir()
     (tmp_path / "depth").mkdir()
-    fails(tmp_path, "color/, depth/")
+    fails(tmp_path, "depth/ and color/ hold no images")
+    fails(tmp_path, "depth/ and color/ hold no images", format="redwood")
+    (tmp_path / "depth").rmdir()
+    fails(tmp_path, "color/ holds no images")
+    write_image(tmp_path / "color/left.png", color_rgb(0))
+    fails(tmp_path, "it holds color/")  # images there are, but none with a number
 
 
 def test_color_without_depth(tmp_path: Path) -> None:
@@ -279,7 +383,7 @@ def test_depth_without_color_is_allowed(tmp_path: Path, caplog: pytest.LogCaptur
         path.unlink()
     sequence = open_sequence(tmp_path)
     assert sequence.read(0).color is None
-    assert open_sequence(tmp_path, scale=0.5).read(0).color is None
+    assert open_sequence(tmp_path, scale=2).read(0).color is None
     assert "no colour" in caplog.text
 
 

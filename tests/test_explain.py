@@ -108,6 +108,21 @@ def test_other_methods_cannot_be_explained():
         explain_icp(config=IcpConfig(method="point-to-plane"))
 
 
+def test_the_verdict_says_that_free_directions_were_put_back():
+    """On a plane that slides in itself the steps drift, but the result stays at the first guess."""
+    rng = np.random.default_rng(0)
+    source, target = (np.column_stack([rng.uniform(0, 1, (100, 2)), np.zeros(100)]) for _ in range(2))
+    explanation = explain_icp(source, target)
+    last = explanation.steps[-1].T_total
+    assert explanation.result.unobservable
+    assert not np.allclose(last, explanation.result.T_target_source)
+    angle = np.degrees(np.arccos((np.trace(last[:3, :3]) - 1) / 2))
+    verdict = " ".join(explanation.verdict.split())
+    assert f"The steps ended at {angle:.4f} deg" in verdict
+    assert "then put back to the first guess" in verdict
+    assert "put back" not in explain_icp().verdict
+
+
 @pytest.mark.parametrize("source", [np.zeros((1, 3)), np.ones((4, 3)), np.arange(12.0).reshape(4, 3)])
 def test_points_without_an_answer_are_explained_too(source):
     for explanation in (explain_horn(source, source + 1), explain_icp(source, source + 1)):
@@ -138,6 +153,16 @@ class TestPictures:
             for color in ((209, 73, 91), (0, 121, 140)):
                 assert (np.abs(image - color).max(axis=2) < 60).sum() > 50
         assert sorted(p.name for p in tmp_path.iterdir()) == ["both.png", "horn.png", "icp.png"]
+
+    @pytest.mark.parametrize(("name", "start"), [("a.pdf", b"%PDF"), ("a.SVG", b"<?xml"), ("a.png", b"\x89PNG")])
+    def test_the_ending_chooses_the_format(self, tmp_path, name, start):
+        draw_horn(tmp_path / name, explain_horn())
+        assert (tmp_path / name).read_bytes().startswith(start)
+
+    def test_other_endings(self, tmp_path):
+        with pytest.raises(OutputError, match=r"must end in \.png"):
+            draw_horn(tmp_path / "a.jpg", explain_horn())
+        assert not list(tmp_path.iterdir())
 
     def test_a_folder_that_does_not_exist(self, tmp_path):
         with pytest.raises(OutputError, match="cannot be written"):

@@ -152,7 +152,7 @@ def append_disc(
 def test_disc_covers_the_pixels_whose_rays_meet_it(normal: tuple[float, ...]) -> None:
     """Drawn: rays that meet the disc's plane within the radius plus three quarters of a pixel."""
     centre, radius = np.array([0.1, -0.05, 1.0]), 0.2
-    picture = render_picture(disc([*centre], [*normal], radius), np.eye(4), SMALL)
+    picture = render_picture(disc([*centre], [*normal], radius), np.eye(4), SMALL, background=17)
     n = np.array(normal) / np.linalg.norm(normal)
     t = (n @ centre) / (SMALL.rays() @ n)
     distance = np.linalg.norm(SMALL.rays() * t[..., None] - centre, axis=-1)
@@ -162,7 +162,7 @@ def test_disc_covers_the_pixels_whose_rays_meet_it(normal: tuple[float, ...]) ->
     assert not drawn[distance > radius + 1.01 * pixel].any()
     np.testing.assert_allclose(picture.depth_m[drawn], t[drawn], rtol=1e-4)
     assert (picture.color[drawn] == 200).all()
-    assert (picture.color[~drawn] == 255).all()
+    assert (picture.color[~drawn] == 17).all()
     np.testing.assert_allclose(picture.normals[drawn], np.broadcast_to(n, picture.normals[drawn].shape), atol=1e-6)
     assert not picture.normals[~drawn].any()
 
@@ -185,7 +185,7 @@ def test_discs_seen_from_behind_or_behind_the_camera_are_not_drawn() -> None:
 def test_picture_of_an_empty_map_is_background() -> None:
     picture = render_picture(sw.SurfelMap(), np.eye(4), SMALL, background=17)
     assert (picture.color == 17).all()
-    assert (picture.normal_colors(np.eye(4)) == 255).all()
+    assert (picture.normal_colors(np.eye(4), background=19) == 19).all()
 
 
 def test_doubtful_surfels_can_be_left_out() -> None:

@@ -16,8 +16,8 @@ import pytest
 import scanweld as sw
 from rendered import CAMERA, MemorySequence, blind, rendered
 from scanweld.config import load_toml
-from scanweld.runs import output
 from scanweld.mapping.rendering import BACKGROUND
+from scanweld.runs import output
 from scanweld.runs.folder import check_writable, next_run_folder, write_folder
 from scanweld.runs.run import RunSummary, summarise
 
@@ -361,7 +361,7 @@ class TestTrust:
     def test_no_usable_frame_is_an_error_and_leaves_nothing(self, tmp_path: Path) -> None:
         sequence = rendered(count=40).part(0, 3)
         for changes in ({k: blind(sequence.frames[k]) for k in range(3)}, dict.fromkeys(range(3))):
-            with pytest.raises(sw.DatasetError, match=r"no frame could be used|none of the 3 frames"):
+            with pytest.raises(sw.DatasetError, match=r"no frame has usable depth|none of the 3 frames"):
                 sw.run_sequence(sequence.with_frames(changes), out=tmp_path / "run")
             assert list(tmp_path.iterdir()) == []
 

@@ -274,7 +274,7 @@ def test_an_existing_folder_is_kept_without_force(tmp_path: Path) -> None:
     render_sequence(target, RenderConfig(width=32, height=24, frames=2), force=True)
     assert len(list((target / "rgb").iterdir())) == 2
     (tmp_path / "file").write_text("")
-    with pytest.raises(OutputError, match="no folder"):
+    with pytest.raises(OutputError, match="is a file"):
         render_sequence(tmp_path / "file", config)
     with pytest.raises(OutputError, match="cannot be written"):
         render_sequence(tmp_path / "file" / "s", config)
@@ -334,3 +334,13 @@ def test_a_camera_outside_the_scene_is_said(tmp_path: Path, caplog: pytest.LogCa
 def test_an_index_out_of_range_is_refused(room: SyntheticSequence) -> None:
     with pytest.raises(IndexError):
         room.read(len(room))
+
+
+@pytest.mark.parametrize(("scene", "name"), [("room", "orbit"), ("corridor", "loop")])
+def test_the_default_path_is_named_where_it_is_recorded(scene: str, name: str) -> None:
+    config = RenderConfig(scene=scene, frames=2)
+    sequence = SyntheticSequence(config)
+    assert sequence.config.path == ""
+    assert sequence.path_name == sequence.config.resolved().path == name
+    assert SyntheticSequence(config.resolved()).name == sequence.name
+    assert RenderConfig(path="sweep").resolved() == RenderConfig(path="sweep")

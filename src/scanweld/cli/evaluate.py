@@ -73,9 +73,7 @@ def _figures(absolute: AteResult, relative: RpeResult | None, num_poses: int) ->
 
 
 def _table(figures: dict[str, Any], align: str, plot: Path | None) -> str:
-    def length(value: float | None) -> str:
-        if value is None:
-            return "none: one matched pose"
+    def length(value: float) -> str:
         return f"{value * 1000:.3f} mm" if value < 0.1 else f"{value:.4f} m"
 
     rotation = figures["rpe_rot_deg"]
@@ -87,8 +85,8 @@ def _table(figures: dict[str, Any], align: str, plot: Path | None) -> str:
         ("ATE mean", length(figures["ate_mean_m"])),
         ("ATE median", length(figures["ate_median_m"])),
         ("ATE max", length(figures["ate_max_m"])),
-        ("RPE translation", length(figures["rpe_trans_m"]) + " a frame (rmse)"),
-        ("RPE rotation", "none" if rotation is None else f"{rotation:.4f} degrees a frame (rmse)"),
+        ("RPE translation", "-" if rotation is None else length(figures["rpe_trans_m"]) + " a frame (rmse)"),
+        ("RPE rotation", "-" if rotation is None else f"{rotation:.4f} degrees a frame (rmse)"),
     ]
     if plot is not None:
         rows.append(("plot", str(plot)))

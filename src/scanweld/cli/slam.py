@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import logging
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -48,14 +51,15 @@ def slam(
     from scanweld.datasets.open import open_sequence
 
     settings = load_config(config, overrides or [])
-    opened = open_sequence(
-        sequence,
-        format=format_name,
-        camera=parse_intrinsics(camera) if camera else None,
-        depth_scale=depth_scale,
-        frames=frames,
-        scale=scale,
-    )
+    with collected_warnings() as warnings:
+        opened = open_sequence(
+            sequence,
+            format=format_name,
+            camera=parse_intrinsics(camera) if camera else None,
+            depth_scale=depth_scale,
+            frames=frames,
+            scale=scale,
+        )
     from scanweld.runs.folder import next_run_folder
 
     folder = out or next_run_folder(sequence.resolve().name)
@@ -63,13 +67,27 @@ def slam(
     description = {
         "input": str(sequence.resolve()), "format": format_name, "frames": frames, "scale": scale, "poses": poses,
         "camera": camera, "depth_scale": depth_scale, "config": str(config) if config else None,
-        "set": overrides or [],
+        "set": overrides or [], "warnings": warnings,
     }  # fmt: skip
     summary = run_with_progress(
         opened, settings, folder, force=force, poses=given, threads=threads, tracked_only=tracked_only,
         description=description, started=started,
     )  # fmt: skip
     return print_summary(summary, json_output=json_output)
+
+
+@contextlib.contextmanager
+def collected_warnings() -> Iterator[list[str]]:
+    """Yield a list that grows by what the library warns of meanwhile."""
+    messages: list[str] = []
+    handler = logging.Handler(logging.WARNING)
+    handler.emit = lambda record: messages.append(record.getMessage())  # type: ignore[method-assign]
+    library = logging.getLogger("scanweld")
+    library.addHandler(handler)
+    try:
+        yield messages
+    finally:
+        library.removeHandler(handler)
 
 
 def load_config(path: Path | None, overrides: list[str]) -> SlamConfig:

@@ -57,6 +57,11 @@ def is_icl_nuim(folder: Path) -> bool:
     return named and first_existing(folder, ("camera.json", "groundtruth.txt")) is None
 
 
+def has_icl_nuim_files(folder: Path) -> bool:
+    """Whether the folder can be read as ICL-NUIM when the caller says that it is: rgb/ and depth/ are enough."""
+    return is_icl_nuim(folder) or ((folder / "rgb").is_dir() and (folder / "depth").is_dir())
+
+
 def open_icl_nuim(folder: Path, overrides: Overrides) -> FileSequence:
     """Open a sequence of ICL-NUIM in either layout; raises DatasetError when it cannot be used."""
     depth = _scene_files(folder, ".depth")

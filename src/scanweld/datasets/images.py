@@ -28,8 +28,17 @@ MAX_DEPTH_M = 65535.0
 SURFACE_BAND = 0.02
 """Depths that differ by less than this share of the depth belong to one surface when an image is resized."""
 
+MAX_SAMPLES = 8
+"""Input rows, and columns, that are looked at for an output pixel when an image is resized."""
+
+MIN_SIDE_PX = 32
+"""Shorter side that an image must keep when it is made smaller; below it there is nothing to track."""
+
 PLAUSIBLE_MEDIAN_M = (0.15, 5.5)
 """Median depth of a scene in front of an RGB-D camera, from a shelf bin at arm's length to a hall [m]."""
+
+CONFUSABLE_UNITS = (1.5, 20.0)
+"""Factors between two units after which a scene still looks like one."""
 
 _KNOWN_DEPTH_SCALES = (1000.0, 5000.0, 1.0, 100.0, 10000.0, 6553.5)  # likeliest first
 _PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
@@ -145,10 +154,11 @@ def valid_depth(depth_m: Array) -> Float32:
 def resize_depth(depth_m: Float32, shape: tuple[int, int]) -> Float32:
     """Resize depth (H, W) [m] to `shape` without mixing surfaces; pixel centres as `PinholeCamera.scaled`.
 
-    The footprint of an output pixel is sampled by a regular grid of input pixels. The surface is the one that
-    most of the valid samples agree with to ``SURFACE_BAND``, the nearer of two equals. The samples on it are
-    averaged in inverse depth, which is linear over the pixels of a plane: a plane comes out exactly, at the
-    pixel centre between the samples. Enlarging takes the nearest pixel.
+    The footprint of an output pixel is sampled by a regular grid of input pixels: by all of them up to
+    ``MAX_SAMPLES`` a side, by so many spread over it beyond. The surface is the one that most of the valid
+    samples agree with to ``SURFACE_BAND``, the nearer of two equals. The samples on it are averaged in inverse
+    depth, which is linear over the pixels of a plane: a plane comes out exactly, at the pixel centre between
+    the samples. Enlarging takes the nearest pixel.
     """
     rows = _footprint(depth_m.shape[0], shape[0])
     columns = _footprint(depth_m.shape[1], shape[1])
@@ -181,7 +191,8 @@ def _on_surface(samples: list[Float32], surface_m: Float32) -> Iterator[Bool]:
 def _footprint(size_in: int, size_out: int) -> Array:
     """Input indices (n, size_out) that sample the footprint of each output pixel, about its centre."""
     step = size_in / size_out
-    n = max(1, math.ceil(step - 1e-9))
+    # Every sample is compared with every other: without a bound the cost grows with the fourth power of the step.
+    n = min(MAX_SAMPLES, max(1, math.ceil(step - 1e-9)))
     offsets = (np.arange(n)[:, None] + 0.5) / n * step
     # In the continuous coordinate of the input, pixel i spans [i, i + 1).
     indices = np.floor(np.arange(size_out) * step + offsets + 1e-9).astype(np.int64)
@@ -223,6 +234,57 @@ def check_depth_unit(median_depth_m: float, depth_scale: float) -> str | None:
         return f"{seen}, which is implausible; pass --depth-scale (units per metre of the depth images)"
     scale = likely[0]
     return f"{seen}; the unit is likely {_unit(scale)} ({raw / scale:.3g} m): pass --depth-scale {scale:g}"
+
+
+def explain_unusable_depth(median_depth_m: float, depth_scale: float, range_m: tuple[float, float]) -> str:
+    """Say in one line why depth gave no surface, and which unit it likely has.
+
+    Parameters
+    ----------
+    median_depth_m : median of the valid depth [m], or 0 when there is none
+    depth_scale : units per metre that the depth was read with
+    range_m : nearest and furthest depth that is used [m]
+    """
+    advice = check_depth_unit(median_depth_m, depth_scale)
+    if advice is not None:
+        return advice
+    low, high = range_m
+    seen = (
+        f"the median depth is {median_depth_m:.3g} m with {depth_scale:g} units per metre, "
+        f"{low:g} to {high:g} m are used"
+    )
+    if low <= median_depth_m <= high:
+        return f"{seen}; the unit looks right, the valid pixels are too few or too scattered"
+    raw = median_depth_m * depth_scale
+    likely = [scale for scale in _KNOWN_DEPTH_SCALES if low <= raw / scale <= high]
+    if not likely:
+        return f"{seen}; widen the range"
+    scale = likely[0]
+    return f"{seen}; widen the range, or, if the unit is {_unit(scale)}, pass --depth-scale {scale:g}"
+
+
+def compare_depth_units(stated: float, passed: float, source: str) -> str | None:
+    """Say in one line that a caller's unit contradicts a stated one by a factor that no picture betrays.
+
+    Parameters
+    ----------
+    stated : units per metre that the sequence has by itself
+    passed : units per metre that the caller asks for
+    source : who states it, as "camera.json" or "the format"
+
+    Returns
+    -------
+    The warning, or None where the two are near each other, or so far that `check_depth_unit` sees it.
+    """
+    low, high = CONFUSABLE_UNITS
+    factor = max(stated, passed) / min(stated, passed)
+    if not low <= factor <= high:
+        return None
+    change = "smaller" if passed > stated else "larger"
+    return (
+        f"depth_scale: the unit of {source} is {stated:g} per metre, {passed:g} was passed: "
+        f"the scene becomes {factor:.3g} times {change}"
+    )
 
 
 def _unit(depth_scale: float) -> str:
@@ -327,8 +389,8 @@ def require_scale(scale: float) -> float:
     return scale
 
 
-def require_depth_scale(depth_scale: float, where: str) -> float:
-    """Return a depth scale after checking that it is a positive number.
+def require_depth_scale(depth_scale: float, where: str = "") -> float:
+    """Return a depth scale after checking that it is a positive number; `where` is the file that states it.
 
     Raises
     ------
@@ -336,5 +398,6 @@ def require_depth_scale(depth_scale: float, where: str) -> float:
         When it is not.
     """
     if not (math.isfinite(depth_scale) and depth_scale > 0):
-        raise DatasetError(f"{where}: depth_scale must be positive (units per metre, e.g. 1000), got {depth_scale}")
+        place = f"{where}: " if where else ""
+        raise DatasetError(f"{place}depth_scale must be positive (units per metre, e.g. 1000), got {depth_scale}")
     return depth_scale

@@ -20,6 +20,9 @@ Intrinsics = tuple[float, float, float, float]
 
 CAMERA_FILE = "camera.json"
 
+PLAUSIBLE_FOCAL = (0.2, 5.0)
+"""Focal length of a depth camera as a multiple of the image width: 136 to 11 degrees across."""
+
 
 @dataclass(frozen=True, slots=True)
 class CameraFile:
@@ -79,7 +82,26 @@ def make_camera(intrinsics: Intrinsics, width: int, height: int, where: str) -> 
     try:
         return PinholeCamera(fx, fy, cx, cy, width, height)
     except InvalidInputError as error:
-        raise DatasetError(f"{where}: {error}") from None
+        raise DatasetError(f"{where}: {str(error).removeprefix('camera: ')}") from None
+
+
+def doubt_camera(camera: PinholeCamera) -> str | None:
+    """Say in one line what is unlikely about a camera of images of its size, or return None."""
+    doubts = []
+    if not (-0.5 <= camera.cx < camera.width - 0.5 and -0.5 <= camera.cy < camera.height - 0.5):
+        doubts.append(f"the principal point {camera.cx:g}, {camera.cy:g} lies outside the image")
+    low, high = PLAUSIBLE_FOCAL
+    doubts += [
+        f"{name} = {focal:g} is {focal / camera.width:.3g} times the image width ({low:g} to {high:g} is usual)"
+        for name, focal in (("fx", camera.fx), ("fy", camera.fy))
+        if not low <= focal / camera.width <= high
+    ]
+    if not doubts:
+        return None
+    return (
+        f"{' and '.join(doubts)}; the images are {camera.width}x{camera.height}: "
+        "are these the intrinsics of the images on disk, as fx, fy, cx, cy in pixels?"
+    )
 
 
 def scaled_default(intrinsics: Intrinsics, width: int, height: int) -> Intrinsics:

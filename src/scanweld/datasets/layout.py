@@ -10,6 +10,7 @@ from pathlib import Path
 from scanweld.datasets.base import DepthReader, FileSequence, FrameFiles, no_readable_frame
 from scanweld.datasets.images import (
     ImageHeader,
+    compare_depth_units,
     depth_header_fault,
     read_depth_png,
     read_header,
@@ -17,8 +18,10 @@ from scanweld.datasets.images import (
 )
 from scanweld.datasets.intrinsics import (
     CAMERA_FILE,
+    CameraFile,
     Intrinsics,
     Overrides,
+    doubt_camera,
     make_camera,
     read_camera_file,
     scaled_default,
@@ -132,6 +135,7 @@ def build_sequence(
         raise DatasetError(
             f"{folder / CAMERA_FILE}: says {given.size[0]}x{given.size[1]}, the images are {width}x{height}"
         )
+    where = "camera" if overrides.camera is not None else str(folder if given is None else folder / CAMERA_FILE)
     if isinstance(overrides.camera, PinholeCamera):
         camera = overrides.camera
         if (camera.width, camera.height) != (width, height):
@@ -140,26 +144,38 @@ def build_sequence(
                 "give the intrinsics of the images on disk, before any scale"
             )
     elif overrides.camera is not None:
-        camera = make_camera(overrides.camera, width, height, "camera")
+        camera = make_camera(overrides.camera, width, height, where)
     elif given is not None:
-        camera = make_camera(given.intrinsics, width, height, str(folder / CAMERA_FILE))
+        camera = make_camera(given.intrinsics, width, height, where)
     elif intrinsics_file is not None:
-        camera = make_camera(intrinsics_file, width, height, str(folder))
+        camera = make_camera(intrinsics_file, width, height, where)
     else:
-        camera = make_camera(scaled_default(intrinsics, width, height), width, height, str(folder))
-    depth_scale, source = default_depth_scale, str(folder)
-    if given is not None and given.depth_scale is not None:
-        depth_scale, source = given.depth_scale, str(folder / CAMERA_FILE)
-    if overrides.depth_scale is not None:
-        depth_scale, source = overrides.depth_scale, "--depth-scale"
+        camera = make_camera(scaled_default(intrinsics, width, height), width, height, where)
+    doubt = doubt_camera(camera)
+    if doubt is not None:
+        logger.warning("%s: %s", where, doubt)
     return FileSequence(
         name=name,
         camera=camera,
         frames=tuple(frames),
-        depth_scale=require_depth_scale(depth_scale, source),
+        depth_scale=_depth_scale(folder, default_depth_scale, given, overrides),
         ground_truth=ground_truth,
         depth_reader=depth_reader,
     )
+
+
+def _depth_scale(folder: Path, default: float, given: CameraFile | None, overrides: Overrides) -> float:
+    """Units per metre: the caller's, else those of camera.json, else the format's."""
+    stated, source = default, "the format"
+    if given is not None and given.depth_scale is not None:
+        stated, source = require_depth_scale(given.depth_scale, str(folder / CAMERA_FILE)), CAMERA_FILE
+    if overrides.depth_scale is None:
+        return stated
+    passed = require_depth_scale(overrides.depth_scale)
+    contradiction = compare_depth_units(stated, passed, source)
+    if contradiction is not None:
+        logger.warning(contradiction)
+    return passed
 
 
 def _image_size(name: str, frames: Sequence[FrameFiles], *, depth_is_image: bool) -> tuple[int, int]:

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from scanweld.datasets.base import RgbdSequence
-from scanweld.datasets.icl_nuim import is_icl_nuim, open_icl_nuim
+from scanweld.datasets.icl_nuim import has_icl_nuim_files, is_icl_nuim, open_icl_nuim
 from scanweld.datasets.intrinsics import Intrinsics, Overrides
-from scanweld.datasets.redwood import is_redwood, open_redwood
+from scanweld.datasets.redwood import empty_image_folders, is_redwood, open_redwood
 from scanweld.datasets.selection import ResizedSequence, select
 from scanweld.datasets.seven_scenes import is_seven_scenes, open_seven_scenes
 from scanweld.datasets.tum import is_tum, open_tum
@@ -30,20 +30,40 @@ class SequenceFormat:
     name : what `--format` takes
     layout : what the folder must hold, in one line
     recognises : whether a folder is of this format
+    suffices : whether a folder has the files that this format needs, when the caller names it
     open : open it; raises DatasetError when it cannot be used
     """
 
     name: str
     layout: str
     recognises: Callable[[Path], bool]
+    suffices: Callable[[Path], bool]
     open: Callable[[Path, Overrides], RgbdSequence]
 
 
 FORMATS = (
-    SequenceFormat("7scenes", "frame-NNNNNN.{color.png,depth.png,pose.txt}", is_seven_scenes, open_seven_scenes),
-    SequenceFormat("icl", "*.gt.freiburg with rgb/ and depth/, or scene_NN_NNNN.depth", is_icl_nuim, open_icl_nuim),
-    SequenceFormat("tum", "rgb.txt and depth.txt, or associations.txt", is_tum, open_tum),
-    SequenceFormat("redwood", "image/ or color/, and depth/ with numbered images", is_redwood, open_redwood),
+    SequenceFormat(
+        "7scenes",
+        "frame-NNNNNN.{color.png,depth.png,pose.txt}",
+        is_seven_scenes,
+        is_seven_scenes,
+        open_seven_scenes,
+    ),
+    SequenceFormat(
+        "icl",
+        "*.gt.freiburg with rgb/ and depth/, or scene_NN_NNNN.depth",
+        is_icl_nuim,
+        has_icl_nuim_files,
+        open_icl_nuim,
+    ),
+    SequenceFormat("tum", "rgb.txt and depth.txt, or associations.txt", is_tum, is_tum, open_tum),
+    SequenceFormat(
+        "redwood",
+        "image/ or color/, and depth/ with numbered images",
+        is_redwood,
+        is_redwood,
+        open_redwood,
+    ),
 )
 """Every format, the most telling file names first: "auto" takes the first that recognises a folder."""
 
@@ -103,14 +123,28 @@ def _find_format(folder: Path, name: str) -> tuple[SequenceFormat, Path]:
     wanted = {"sevenscenes": "7scenes", "tumrgbd": "tum"}.get(wanted, wanted)
     if wanted != "auto" and wanted not in known:
         raise DatasetError(f"format '{name}' is not known; known are auto, {', '.join(known)}")
-    rows = FORMATS if wanted == "auto" else (known[wanted],)
+    named = known.get(wanted)
     children = [child for child in folder.iterdir() if child.is_dir() and not child.name.startswith(".")]
-    for place in (folder, *(children if len(children) == 1 else ())):
-        for row in rows:
-            if row.recognises(place):
-                return row, place
-    if wanted != "auto":
-        return known[wanted], folder  # its own error says what is missing
+    places = (folder, *(children if len(children) == 1 else ()))
+    for place in places:
+        if named is not None and named.suffices(place):
+            return named, place
+    recognised = ((row, place) for place in places for row in FORMATS if row.recognises(place))
+    found = next(recognised, None)
+    if named is None and found is not None:
+        return found
+    if found is not None:
+        raise DatasetError(
+            f"{folder}: not a sequence of format '{wanted}', which needs {known[wanted].layout}; "
+            f"it looks like '{found[0].name}': name that format, or 'auto'"
+        )
+    empty = empty_image_folders(folder)
+    if empty:
+        raise DatasetError(f"{folder}: {' and '.join(empty)} hold{'s' * (len(empty) == 1)} no images")
+    if named is not None:
+        raise DatasetError(
+            f"{folder}: not a sequence of format '{wanted}', which needs {named.layout}; it holds {_content(folder)}"
+        )
     layouts = "; ".join(f"{row.name}: {row.layout}" for row in FORMATS)
     raise DatasetError(f"{folder}: not a sequence of a known format ({layouts}); it holds {_content(folder)}")
 

@@ -43,6 +43,13 @@ def is_redwood(folder: Path) -> bool:
     return any(numbered_files(folder / name, COLOR_SUFFIXES) for name in names)
 
 
+def empty_image_folders(folder: Path) -> list[str]:
+    """Return the depth and colour folders of a sequence, as "depth/", if none of them has any image."""
+    names = [name for name in ("depth", *COLOR_FOLDERS) if (folder / name).is_dir()]
+    images = any(path.suffix.lower() in COLOR_SUFFIXES for name in names for path in (folder / name).iterdir())
+    return [] if images else [f"{name}/" for name in names]
+
+
 def open_redwood(folder: Path, overrides: Overrides) -> FileSequence:
     """Open a sequence in the Redwood layout; raises DatasetError when it cannot be used."""
     color_folder = first_existing(folder, COLOR_FOLDERS)

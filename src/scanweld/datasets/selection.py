@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 from scanweld.arrays import Float64
 from scanweld.datasets.base import RgbdSequence, readable_frames
-from scanweld.datasets.images import require_scale, resize_color, resize_depth
+from scanweld.datasets.images import MIN_SIDE_PX, require_scale, resize_color, resize_depth
 from scanweld.errors import InvalidInputError
 from scanweld.geometry.camera import PinholeCamera
 from scanweld.geometry.frame import Frame
@@ -64,7 +65,7 @@ class ResizedSequence:
     Raises
     ------
     InvalidInputError
-        When the scale is not within (0, 4].
+        When the scale is not within (0, 4], or leaves fewer than 32 pixels of the shorter side.
     """
 
     base: RgbdSequence
@@ -72,6 +73,7 @@ class ResizedSequence:
 
     def __post_init__(self) -> None:
         require_scale(self.scale)
+        _require_size(self.base.camera, self.scale)
 
     @property
     def name(self) -> str:
@@ -109,6 +111,18 @@ class ResizedSequence:
 
     def __iter__(self) -> Iterator[Frame]:
         return readable_frames(self)
+
+
+def _require_size(camera: PinholeCamera, scale: float) -> None:
+    side = min(camera.width, camera.height)
+    if scale >= 1 or round(side * scale) >= MIN_SIDE_PX:
+        return
+    smallest = math.ceil(1000 * MIN_SIDE_PX / side) / 1000
+    fix = f"use {smallest:g} or more" if smallest < 1 else "such images cannot be made smaller"
+    raise InvalidInputError(
+        f"scale: {scale:g} would make the {camera.width}x{camera.height} images {round(camera.width * scale)}x"
+        f"{round(camera.height * scale)}, with less than {MIN_SIDE_PX} pixels on the shorter side; {fix}"
+    )
 
 
 def select(sequence: RgbdSequence, frames: str | slice) -> RgbdSequence:

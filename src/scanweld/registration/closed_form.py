@@ -133,7 +133,7 @@ def align_closed_form(
     status = Status.CONVERGED
     if len(a) < dimension:
         status = Status.TOO_FEW_CORRESPONDENCES
-        notes.insert(0, f"{len(a)} pairs, {dimension} are needed in {dimension}-D")
+        notes.insert(0, f"{len(a)} pair{'s' * (len(a) != 1)}, {dimension} are needed in {dimension}-D")
     elif free:
         status = Status.DEGENERATE
         notes.insert(0, f"the pairs leave free: {', '.join(direction.words for direction in free)}")

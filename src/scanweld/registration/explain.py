@@ -56,7 +56,7 @@ class HornExplanation:
     def text(self) -> str:
         """Return all of it as plain text, 80 columns wide."""
         n, d = self.source.shape
-        lines = [f"Horn's method: {n} pairs in {d}-D, b_i = s R a_i + t", ""]
+        lines = [f"Horn's method: {n} pair{'s' * (n != 1)} in {d}-D, b_i = s R a_i + t", ""]
         lines += _fit_lines(self.fit, self.source, self.target, self.terms)
         if self.scales:
             a, b = self.fit.source_spread, self.fit.target_spread
@@ -224,8 +224,15 @@ def _verdict(a: Float64, b: Float64, result: RegistrationResult) -> str:
         return f"Verdict: {result.status.value}. {_sentence(result.note)}"
     pairs = result.history[-1].pairs
     words = [
-        f"Verdict: {result.status.value} after {result.num_iterations} steps; {turned}, rmse {_n(result.rmse_m)} m."
+        f"Verdict: {result.status.value} after {result.num_iterations} step{'s' * (result.num_iterations != 1)}; "
+        f"{turned}, rmse {_n(result.rmse_m)} m."
     ]
+    last = result.history[-1].T_after
+    if not np.allclose(last, result.T_target_source, rtol=0, atol=1e-9 * max(1.0, float(np.abs(last).max()))):
+        words.append(
+            f"The steps ended at {_n(_angle_deg(last))} deg and t = {_vector(last[:-1, -1])}; along the free "
+            "directions the motion was then put back to the first guess, because the data does not hold it there."
+        )
     if pairs.num_targets < len(pairs):
         left = len(b) - pairs.num_targets
         words.append(

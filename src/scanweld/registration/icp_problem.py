@@ -135,8 +135,8 @@ def prepare_problem(
     num_threads: int | None,
 ) -> Problem | RegistrationResult:
     """Validate, drop, centre, index; or say at once why there is no answer."""
-    if isinstance(target, PointCloud) and target_normals is None:
-        target_normals = target.normals
+    if isinstance(target, PointCloud) and target_normals is None and config.method == "point-to-plane":
+        target_normals = target.normals  # a cloud may carry normals that the method does not use
     b = as_points(target.points_m if isinstance(target, PointCloud) else target, "target")
     dimension = b.shape[1]
     a = as_points(source.points_m if isinstance(source, PointCloud) else source, "source", dimensions=(dimension,))

@@ -1,7 +1,11 @@
-"""Pictures of alignments: before and after, and every step of ICP. Matplotlib is loaded when one is drawn."""
+"""Pictures of alignments: before and after, and every step of ICP.
+
+Matplotlib is loaded when one is drawn. The ending of the name chooses the format: .png, .pdf or .svg.
+"""
 
 from __future__ import annotations
 
+import io
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,22 +17,26 @@ from scanweld.arrays import Float64, Int64
 from scanweld.errors import OutputError
 from scanweld.geometry import se3
 from scanweld.geometry.point_cloud import PointCloud
+from scanweld.io.atomic import write_file
 from scanweld.registration.explain import HornExplanation, IcpExplanation
 from scanweld.registration.result import RegistrationResult
 
 _SOURCE, _TARGET, _PAIR, _INK = "#d1495b", "#00798c", "#9aa5b1", "#22303c"
 _MOST_DRAWN = 30_000
 
+FORMATS = (".png", ".pdf", ".svg")
+"""Endings of the pictures that can be written."""
+
 
 def draw_alignment(
     path: str | os.PathLike[str], source: PointCloud, target: PointCloud, result: RegistrationResult
 ) -> None:
-    """Draw source and target before and after the alignment, seen along their thinnest direction, as PNG.
+    """Draw source and target before and after the alignment, seen along their thinnest direction.
 
     Raises
     ------
     OutputError
-        When the file cannot be written.
+        When the file cannot be written, or its name has another ending than .png, .pdf or .svg.
     """
     moved = source.transformed(result.T_target_source, result.scale)
     view = _View(target.points_m)
@@ -47,7 +55,7 @@ def draw_alignment(
 
 
 def draw_horn(path: str | os.PathLike[str], explanation: HornExplanation) -> None:
-    """Draw the pairs before and after Horn's method as PNG; lines join partners."""
+    """Draw the pairs before and after Horn's method; lines join partners."""
     fit = explanation.fit
     moved = fit.scale * explanation.source @ fit.rotation.T + fit.translation_m
     view = _View(explanation.target)
@@ -60,7 +68,7 @@ def draw_horn(path: str | os.PathLike[str], explanation: HornExplanation) -> Non
 
 
 def draw_icp(path: str | os.PathLike[str], explanation: IcpExplanation, most: int = 8) -> None:
-    """Draw the pairs of every step as PNG: the source moves, the target stays; the last panel is the end."""
+    """Draw the pairs of every step: the source moves, the target stays; the last panel is the end."""
     result, view = explanation.result, _View(explanation.target)
     extent = float(np.ptp(explanation.target, axis=0).max())
     settled = bool(result.history) and result.history[-1].displacement_m <= 1e-9 * extent
@@ -170,10 +178,8 @@ def _finish(path: str | os.PathLike[str], figure: Any, axes: Sequence[Any], view
         handle.set_sizes([36])
         handle.set_alpha(1.0)
     target = Path(path)
-    aside = target.with_name(f".{target.name}.tmp")
-    try:
-        figure.savefig(aside, format="png", facecolor="white")
-        aside.replace(target)
-    except OSError as error:
-        aside.unlink(missing_ok=True)
-        raise OutputError(f"{target}: cannot be written: {error.strerror or error}") from None
+    if target.suffix.lower() not in FORMATS:
+        raise OutputError(f"{target}: a picture's name must end in {' or '.join(FORMATS)}")
+    picture = io.BytesIO()
+    figure.savefig(picture, format=target.suffix[1:].lower(), facecolor="white")
+    write_file(target, picture.getvalue())

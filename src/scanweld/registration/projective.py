@@ -290,11 +290,8 @@ def _judge(
         return Status.TOO_FEW_CORRESPONDENCES, f"{last.num_matched} matches, fewer than {config.min_points}"
     if overlap < config.min_overlap:
         return Status.NO_OVERLAP, f"only {overlap:.0%} of the points match"
-    if agreement.agree < config.min_agreement or agreement.conflict > config.max_conflict:
-        return Status.NO_OVERLAP, (
-            f"only {agreement.agree:.0%} of the points agree with the depth, "
-            f"{agreement.conflict:.0%} would stand in free space"
-        )
+    if not agreement.fits(config):
+        return Status.NO_OVERLAP, agreement.words
     if free:
         return Status.DEGENERATE, "free: " + "; ".join(direction.words for direction in free)
     if not converged:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -18,6 +19,20 @@ SIGNIFICANCE = 4.0
 
 MIN_SHARE = 0.25
 """A constraint of which both sides see at least this share is not made of noise, however few the points."""
+
+
+class AgreementLimits(Protocol):
+    """What a trusted answer needs; :class:`~.projective.ProjectiveConfig` has them."""
+
+    @property
+    def min_agreement(self) -> float:
+        """Smallest share of points that agree."""
+        ...
+
+    @property
+    def max_conflict(self) -> float:
+        """Largest share of points in front of the depth."""
+        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +51,17 @@ class Agreement:
     agree: float
     conflict: float
     hidden: float
+
+    def fits(self, limits: AgreementLimits) -> bool:
+        """Whether the shares are within the limits of a trusted answer."""
+        return self.agree >= limits.min_agreement and self.conflict <= limits.max_conflict
+
+    @property
+    def words(self) -> str:
+        """The shares in words."""
+        return (
+            f"only {self.agree:.0%} of the points agree with the depth, {self.conflict:.0%} would stand in free space"
+        )
 
 
 def check_against_depth(

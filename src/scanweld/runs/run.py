@@ -15,7 +15,7 @@ import numpy as np
 
 from scanweld.arrays import Float64
 from scanweld.datasets.base import RgbdSequence
-from scanweld.datasets.images import check_depth_unit
+from scanweld.datasets.images import check_depth_unit, explain_unusable_depth
 from scanweld.datasets.stream import stream
 from scanweld.errors import DatasetError, InvalidInputError
 from scanweld.evaluation.surface_metrics import compression_ratio
@@ -66,6 +66,7 @@ class _Tally:
     """What is counted while frames go by."""
 
     num_points_input: int = 0
+    median_depth_m: float = 0.0  # of the first frame with depth
     unit_doubted: bool = False
     warnings: list[str] = field(default_factory=list)
 
@@ -97,7 +98,7 @@ def run_sequence(
     poses : fuse at these T_world_camera instead of tracking; frames without one within 0.02 s are skipped
     progress : called after each frame
     tracked_only : leave lines of frames without a measured pose out of trajectory.txt
-    description : goes into run.json as it is
+    description : goes into run.json; its "warnings" are put before those of the run
     started : `time.perf_counter()` from which seconds_total counts; default now
 
     Raises
@@ -124,10 +125,10 @@ def run_sequence(
             raise  # there is nothing to keep
         interrupted = True
         tally.warn(f"interrupted after {len(slam.results)} of {len(sequence)} frames")
-    if not any(result.state in POSED for result in slam.results):
-        raise DatasetError(f"{sequence.name}: no frame could be used; the first: {slam.results[0].note}")
-    if len(slam.map) == 0:  # frames at given poses need no surfaces
-        raise DatasetError(f"{sequence.name}: no frame has usable depth, the map is empty; is the depth scale right?")
+    tracked = any(result.state in POSED for result in slam.results)
+    if not tracked or len(slam.map) == 0:  # frames at given poses need no surfaces
+        why = explain_unusable_depth(tally.median_depth_m, sequence.depth_scale, (0.0, config.surfaces.max_depth_m))
+        raise DatasetError(f"{sequence.name}: no frame has usable depth, the map is empty; {why}")
     metrics, error = summarise(slam, sequence.ground_truth, tally.num_points_input)
     metrics["seconds_total"] = time.perf_counter() - started
     summary = RunSummary(out, metrics, tuple(slam.results), slam.map, interrupted)
@@ -136,7 +137,11 @@ def run_sequence(
             write_run(
                 aside, slam, sequence, config, metrics, error,
                 tracked_only=tracked_only,
-                description={**(description or {}), "warnings": tally.warnings, "interrupted": interrupted},
+                description={
+                    **(description or {}),
+                    "warnings": [*(description or {}).get("warnings", ()), *tally.warnings],
+                    "interrupted": interrupted,
+                },
                 started=started,
             )  # fmt: skip
     return summary
@@ -161,7 +166,8 @@ def _process_all(
                 depth = record.frame.depth_m
                 tally.num_points_input += int(np.count_nonzero(depth))
                 if record.index < UNIT_CHECK_FRAMES and not tally.unit_doubted and depth.any():
-                    advice = check_depth_unit(float(np.median(depth[depth > 0])), sequence.depth_scale)
+                    tally.median_depth_m = float(np.median(depth[depth > 0]))
+                    advice = check_depth_unit(tally.median_depth_m, sequence.depth_scale)
                     if advice:
                         tally.unit_doubted = True
                         tally.warn(advice)

@@ -13,6 +13,7 @@ from scanweld.geometry.depth import SurfacePyramid
 from scanweld.geometry.views import ModelView
 from scanweld.registration.projective import ProjectiveConfig, align_projective, schedules
 from scanweld.registration.result import RegistrationResult, Status
+from scanweld.registration.verification import check_against_depth
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -34,6 +35,9 @@ class TrackingConfig:
     def __post_init__(self) -> None:
         check_ranges(self)
 
+
+FAR_TURN_RAD = 0.15
+"""An answer turned further than this from the prediction must pass the strict free-space check."""
 
 MIN_STABLE_SHARE = 0.5
 """Share of the visible surfels that must be stable for the others to be left out."""
@@ -63,6 +67,12 @@ class FrameToModelTracker:
         T_camera_world = se3.inverse(T_world_camera)
         first, *wider = schedules(self.config.projective)
         best = align_projective(positions, normals, pyramid.levels, T_camera_world, first)
+        shift, turn = np.split(se3.log(best.T_target_source @ se3.inverse(T_camera_world)), 2)
+        far = np.linalg.norm(shift) > first.coarse_gate_m or np.linalg.norm(turn) > FAR_TURN_RAD
+        if best.status.has_pose and far:  # the prediction speaks against it, so the depth must speak for it
+            agreement = check_against_depth(positions, normals, best.T_target_source, pyramid.levels[0])
+            if not agreement.fits(wider[0] if wider else first):
+                best = replace(best, status=Status.NO_OVERLAP, note=f"far from the prediction, and {agreement.words}")
         if not best.status.has_pose:
             for schedule in wider:
                 result = align_projective(positions, normals, pyramid.levels, T_camera_world, schedule)

@@ -69,13 +69,9 @@ def _check_backwards(
         return result
     positions, normals = surface_points(target)
     agreement = check_against_depth(positions, normals, se3.inverse(result.T_target_source), source.levels[0])
-    if agreement.agree >= config.min_agreement and agreement.conflict <= config.max_conflict:
+    if agreement.fits(config):
         return result
-    note = (
-        f"seen from the second frame only {agreement.agree:.0%} of the points agree, "
-        f"{agreement.conflict:.0%} would stand in free space"
-    )
-    return replace(result, status=Status.NO_OVERLAP, note=note)
+    return replace(result, status=Status.NO_OVERLAP, note=f"seen from the second frame {agreement.words}")
 
 
 def surface_points(pyramid: SurfacePyramid) -> tuple[Float32, Float32]:

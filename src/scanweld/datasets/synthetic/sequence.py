@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from scanweld.arrays import Array, Float32, Float64, UInt8
 from scanweld.config import check_ranges, setting
 from scanweld.datasets.synthetic.catalogue import SCENES, build_scene
 from scanweld.datasets.synthetic.noise import NOISE_MODELS, degrade_color, degrade_depth
-from scanweld.datasets.synthetic.paths import choose_path
+from scanweld.datasets.synthetic.paths import choose_path, path_names
 from scanweld.datasets.synthetic.rendering import render_frame
 from scanweld.errors import ConfigError
 from scanweld.geometry.camera import PinholeCamera
@@ -58,6 +58,10 @@ class RenderConfig:
             if value not in choices:
                 raise ConfigError(f"{name} = '{value}': expected one of {', '.join(choices)}")
 
+    def resolved(self) -> RenderConfig:
+        """Return this configuration with the name of the path that '' stands for, as records should have it."""
+        return replace(self, path=self.path or path_names(self.scene)[0])
+
     def camera(self) -> PinholeCamera:
         """Return the camera: 525 pixels of focal length at 640 pixels of width, square pixels, centred."""
         if self.width * 3 == self.height * 4:
@@ -77,6 +81,12 @@ class SyntheticSequence:
     ----------
     config : what to render; the default is the furnished room
 
+    Attributes
+    ----------
+    config : as it was given; `config.resolved()` names the path that '' stands for
+    path_name : name of the built-in path, or of the file without its folder and endings
+    name, camera, depth_scale, ground_truth, timestamps_s : as every sequence has them
+
     Raises
     ------
     ConfigError, FileFormatError, InvalidInputError
@@ -86,8 +96,8 @@ class SyntheticSequence:
     def __init__(self, config: RenderConfig | None = None) -> None:
         self.config = config or RenderConfig()
         c = self.config
-        path_name, self._trajectory = choose_path(c.scene, c.path, c.path_frame, c.frames, c.fps)
-        self.name = f"{c.scene}-{path_name}" + ("" if c.noise == "none" else f"-{c.noise}")
+        self.path_name, self._trajectory = choose_path(c.scene, c.path, c.path_frame, c.frames, c.fps)
+        self.name = f"{c.scene}-{self.path_name}" + ("" if c.noise == "none" else f"-{c.noise}")
         self.camera = c.camera()
         self.depth_scale = DEPTH_SCALE
         self._warned = False
