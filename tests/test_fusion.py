@@ -13,7 +13,7 @@ import scanweld as sw
 from rendered import CAMERA, frame_of, plane_depth, rendered
 from scanweld.geometry import se3
 from scanweld.geometry.depth import SurfacePyramid
-from scanweld.mapping.fusion import FusionConfig, radial_weight, remove_unstable
+from scanweld.mapping.fusion import FusionConfig, radial_weight, tidy
 from scanweld.mapping.rendering import find_candidates, render_index_map
 
 SMALL = sw.PinholeCamera(40.0, 41.0, 19.3, 14.8, 40, 30)
@@ -332,15 +332,30 @@ class TestFreeSpace:
         assert np.isfinite(mapper.map.positions_m).all()
 
 
+NOTHING_SEEN = np.full((1, 1), -1, np.int32)
+"""An index map without surfels."""
+
+
 class TestRemoval:
+    def test_what_is_in_view_comes_first_in_the_order_of_the_image(self) -> None:
+        """Six stable surfels, the fourth doomed, numbers 5, 3 and 2 in view, row by row: 5 2, then 0 1 4."""
+        surfels = sw.SurfelMap()
+        names = np.arange(6, dtype=np.float32)
+        vectors = np.stack([names, names, names])
+        confidence = np.array([9, 9, 9, 0, 9, 9], np.float32)
+        surfels.append(vectors, vectors, vectors, names + 1, confidence, 0)
+        assert tidy(surfels, np.array([[-1, 5], [3, 2]], np.int32), 1, FusionConfig()) == 1
+        np.testing.assert_array_equal(surfels.positions_m[0], [5, 2, 0, 1, 4])
+        np.testing.assert_array_equal(surfels.radii_m, [6, 3, 1, 2, 5])
+
     def test_unstable_surfels_go_after_their_time_and_stable_ones_stay(self) -> None:
         config = FusionConfig(stable_confidence=2.0, unstable_frames=10)
         surfels = sw.SurfelMap()
         confidence = np.array([1.9, 2.0, 1.0, 0.0, 50.0], np.float32)
         vectors = np.zeros((3, 5), np.float32)
         surfels.append(vectors, vectors, vectors, confidence, confidence, 0)
-        assert remove_unstable(surfels, 10, config) == 1  # only the one without any confidence
-        assert remove_unstable(surfels, 11, config) == 2
+        assert tidy(surfels, NOTHING_SEEN, 10, config) == 1  # only the one without any confidence
+        assert tidy(surfels, NOTHING_SEEN, 11, config) == 2
         np.testing.assert_array_equal(surfels.confidences, [2.0, 50.0])
 
     def test_a_speck_is_gone_after_the_time_of_grace(self) -> None:

@@ -108,7 +108,8 @@ def read_depth_png(path: Path, shape: tuple[int, int], depth_scale: float) -> Fl
         raise UnreadableFrameError(f"{path}: {fault}")
     raw = _decode(path, data, cv2.IMREAD_UNCHANGED)
     depth: Float32 = np.divide(raw, np.float32(depth_scale), dtype=np.float32)
-    depth[raw == 65535] = 0
+    if raw.max() == 65535:
+        depth[raw == 65535] = 0
     return depth
 
 

@@ -103,16 +103,15 @@ def surface_rows(start, stop, depth, intrinsics, radius, noise, min_cosine, out)
             good = good & (cosine > min_cosine)
             flip = -one / max(length, np.float32(1e-12)) if good else zero
             z = depth[v, u]
-            row = out[v, u]
-            row[0] = x * z
-            row[1] = y * z
-            row[2] = z
-            row[3] = a * flip
-            row[4] = b * flip
-            row[5] = c * flip
-            row[6] = one / (noise[0] + noise[1] * (z - noise[2]) * (z - noise[2])) if good else zero
+            out[v, u, 0] = x * z
+            out[v, u, 1] = y * z
+            out[v, u, 2] = z
+            out[v, u, 3] = a * flip
+            out[v, u, 4] = b * flip
+            out[v, u, 5] = c * flip
+            out[v, u, 6] = one / (noise[0] + noise[1] * (z - noise[2]) * (z - noise[2])) if good else zero
             # Radius of the disc that covers the pixel on the slanted surface (Keller et al. 2013, sec. 3.1).
-            row[7] = z * np.float32(0.70711) / fx / max(cosine, np.float32(0.26)) if good else zero
+            out[v, u, 7] = z * np.float32(0.70711) / fx / max(cosine, np.float32(0.26)) if good else zero
 
 
 @kernel

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from scanweld.arrays import Float64
+from scanweld.arrays import Float64, Int32
 from scanweld.geometry import se3
 from scanweld.geometry.camera import PinholeCamera
 from scanweld.geometry.depth import SurfacePyramid
@@ -26,38 +26,46 @@ class SurfelMapper:
         self.map = SurfelMap()
         self._frames_fused = 0
         self._candidates: Candidates | None = None
+        self._index_map: Int32 | None = None
         self._viewed_from: tuple[Float64, PinholeCamera] | None = None
 
     def view(self, T_world_camera: Float64, camera: PinholeCamera) -> ModelView:
         """Return the map as a camera at `T_world_camera` sees it."""
         self._candidates = find_candidates(self.map, T_world_camera, camera)
         self._viewed_from = T_world_camera, camera
-        return render_model_view(self.map, self._candidates, T_world_camera, camera, self.config.stable_confidence)
+        seen = render_model_view(self.map, self._candidates, T_world_camera, camera, self.config.stable_confidence)
+        self._index_map = seen.index_map
+        return seen
 
     def fuse(self, pyramid: SurfacePyramid, T_world_camera: Float64) -> FusionCounts:
         """Merge a frame seen from `T_world_camera` into the map."""
-        camera, candidates = pyramid.levels[0].camera, self._candidates
-        if candidates is None or not self._near_the_view(T_world_camera, camera):
+        camera, candidates, index_map = pyramid.levels[0].camera, self._candidates, None
+        if candidates is None or self._moved_pixels(T_world_camera, camera, NEAREST_M) > VIEW_MARGIN_PIXELS:
             candidates = find_candidates(self.map, T_world_camera, camera)
-        counts = fuse(self.map, candidates, pyramid, T_world_camera, self._frames_fused, self.config)
+        elif self._moved_pixels(T_world_camera, camera, TYPICAL_M) < SAME_VIEW_PIXELS:
+            index_map = self._index_map
+        counts = fuse(self.map, candidates, pyramid, T_world_camera, self._frames_fused, self.config, index_map)
         self._frames_fused += 1
-        self._candidates = None
+        self._candidates = self._index_map = None
         return counts
 
     def apply(self, correction: MapCorrection) -> None:
         """Move surfels with their keyframes."""
         self.map.apply_correction(correction)
-        self._candidates = None
+        self._candidates = self._index_map = None
 
-    def _near_the_view(self, T_world_camera: Float64, camera: PinholeCamera) -> bool:
-        """Whether what is seen from here lies within the margin of the last view."""
+    def _moved_pixels(self, T_world_camera: Float64, camera: PinholeCamera, depth_m: float) -> float:
+        """How far the image has moved since the last view, at most, where surfaces are no nearer than `depth_m`."""
         if self._viewed_from is None or self._viewed_from[1] != camera:
-            return False
+            return np.inf
         motion = se3.inverse(self._viewed_from[0]) @ T_world_camera
         shift, turn = float(np.linalg.norm(motion[:3, 3])), float(se3.rotation_angle_rad(motion))
         # At the corners of the image a turn moves pixels by half as much again as in the middle.
-        return max(camera.fx, camera.fy) * (1.5 * turn + shift / NEAREST_M) < VIEW_MARGIN_PIXELS
+        return max(camera.fx, camera.fy) * (1.5 * turn + shift / depth_m)
 
 
-NEAREST_M = 0.3
-"""Surfaces nearer than this are not expected when a view is used again."""
+NEAREST_M, TYPICAL_M = 0.3, 1.0
+"""Surfaces are not expected to be nearer than the first, and mostly beyond the second."""
+
+SAME_VIEW_PIXELS = 0.5
+"""A surfel that moved less than this since the prediction stays in the pixel where it was seen."""

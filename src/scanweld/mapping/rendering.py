@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from scanweld.geometry.depth import intrinsics_array
 from scanweld.geometry.views import ModelView
 from scanweld.mapping import kernels
 from scanweld.mapping.surfel_map import SurfelMap
-from scanweld.parallel import get_num_threads, run_ranges, split_range
+from scanweld.parallel import get_num_threads, run_ranges
 
 FARTHEST_M = 2000.0
 """Micrometres up to here fit the depth buffer's keys."""
@@ -82,7 +83,7 @@ def render_index_map(
     """
     chunks = len(candidates.counts)
     # More than four buffers cost more to clear and merge than their threads gain.
-    parts = split_range(chunks, min(get_num_threads(), 4)) if chunks else []
+    parts = _even_shares(candidates.counts, min(get_num_threads(), 4)) if chunks else []
     buffers = np.full((max(1, len(parts)), *camera.shape), kernels.EMPTY, np.int64)
     transform, intrinsics = _camera_arrays(T_world_camera, camera)
     arrays, stable = surfels.arrays, np.float32(stable_confidence)
@@ -99,6 +100,14 @@ def render_index_map(
     index_map, row_counts = np.empty(camera.shape, np.int32), np.empty(camera.height, np.int64)
     run_ranges(camera.height, lambda start, stop: kernels.resolve(start, stop, buffers, index_map, row_counts))
     return index_map, row_counts
+
+
+def _even_shares(counts: Int64, parts: int) -> list[tuple[int, int]]:
+    """Split the chunks into contiguous ranges with about equally many candidates: those in view lie close together."""
+    total = np.cumsum(counts)
+    bounds = np.searchsorted(total, total[-1] * np.arange(1, parts) / parts, side="left") + 1
+    bounds = np.unique(np.concatenate([[0], np.minimum(bounds, len(counts)), [len(counts)]]))
+    return list(pairwise(bounds.tolist()))
 
 
 def render_model_view(

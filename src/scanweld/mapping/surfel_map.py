@@ -9,6 +9,7 @@ import numpy as np
 from scanweld.arrays import Array, Bool, Float32, Int32, UInt8
 from scanweld.errors import InvalidInputError
 from scanweld.geometry.views import MapCorrection
+from scanweld.parallel import run_ranges
 
 _COLUMNS: tuple[tuple[str, int, type], ...] = (
     ("positions", 3, np.float32),
@@ -167,16 +168,20 @@ class SurfelMap:
         if doomed.shape != (self._count,):
             raise InvalidInputError(f"map: expected a mask of shape ({self._count},), got {doomed.shape}")
         gone = int(np.count_nonzero(doomed))
-        if gone == 0:
-            return 0
-        # Columns before the first doomed one stay where they are: late removals move little.
-        first = int(np.argmax(doomed))
-        kept = first + np.flatnonzero(~doomed[first:])
-        for name, _, _ in _COLUMNS:
-            column = getattr(self._arrays, name)
-            column[..., first : first + len(kept)] = column[..., kept]
-        self._count -= gone
+        if gone:
+            self.keep(np.flatnonzero(~doomed))
         return gone
+
+    def keep(self, order: Array) -> None:
+        """Keep the surfels that `order` (M,) lists, each at most once, in that order, and drop the others."""
+        rows = [row for name, _, _ in _COLUMNS for row in np.atleast_2d(getattr(self._arrays, name))]
+
+        def body(start: int, stop: int) -> None:
+            for row in rows[start:stop]:
+                row[: len(order)] = row[order]
+
+        run_ranges(len(rows), body)
+        self._count = len(order)
 
     def apply_correction(self, correction: MapCorrection) -> None:
         """Move the surfels of each named keyframe by its T_new_old."""

@@ -169,7 +169,13 @@ def align_projective(
     start = np.array(T_target_source, dtype=np.float64)
     end = _descend(positions_m, normals, target, start, config)
     num_free = 0 if end.parts is None else int((~end.parts.observable).sum())
-    held = noise_directions(end.positions_m, end.normals, end.T_target_source, target[0], end.centroid_m, end.radius_m)
+    # Noise on normals is a slope of less than 13 degrees: a geometry that constrains more is no noise.
+    weak = end.parts is None or float(end.parts.values.min()) < WEAK_CONSTRAINT
+    held = (
+        noise_directions(end.positions_m, end.normals, end.T_target_source, target[0], end.centroid_m, end.radius_m)
+        if weak
+        else np.zeros((6, 0))
+    )
     if num_free < held.shape[1] < 6:
         # Noise has moved what nothing constrains: again from the start, along the other directions only.
         history = end.history
@@ -193,6 +199,10 @@ def align_projective(
         note=note,
         history=tuple(end.history) if keep_history else (),
     )
+
+
+WEAK_CONSTRAINT = 0.05
+"""Mean squared slope along a direction below which it could be noise."""
 
 
 @dataclass(slots=True)

@@ -104,6 +104,8 @@ class FrameToModelTracker:
             above, tied = np.flatnonzero(confidences > limit), np.flatnonzero(confidences == limit)
             more = wanted - len(above)
             stable = stable[np.sort(np.concatenate([above, tied[np.arange(more) * len(tied) // more]]))]
+        # The aligner reads no more than this: an even share of the image, before anything is copied.
+        stable = stable[:: max(1, -(-len(stable) // self.config.projective.max_points))]
         if len(stable) == len(view):
             return view.positions_m, view.normals
         return np.take(view.positions_m, stable, axis=1), np.take(view.normals, stable, axis=1)
