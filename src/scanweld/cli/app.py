@@ -65,10 +65,19 @@ def options(
         raise typer.Exit
 
 
+class _LowerCaseLevel(logging.Formatter):
+    """Log lines look like error lines: "warning: ..."."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        record.level = record.levelname.lower()
+        return super().format(record)
+
+
 def run(arguments: Sequence[str]) -> int:
     """Run one command line and return its exit code."""
-    logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s", stream=sys.stderr, force=True)
-    logging.addLevelName(logging.WARNING, "warning")
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(_LowerCaseLevel("%(level)s: %(message)s"))
+    logging.basicConfig(level=logging.WARNING, handlers=[handler], force=True)
     command = typer.main.get_command(app)
     try:
         code = command.main(list(arguments), prog_name="scanweld", standalone_mode=False)

@@ -102,6 +102,16 @@ def solve(equations: NormalEquations, parts: Spectrum) -> Float64:
     return step
 
 
+def standard_deviation(equations: NormalEquations, parts: Spectrum) -> float:
+    """Return how far the observable part of the estimate is off, as a root mean square displacement [m].
+
+    Weights must be inverse variances, so that the inverse of the information is the covariance.
+    """
+    if not parts.observable.any() or equations.total_weight <= 0:
+        return 0.0
+    return float(np.sqrt((1 / parts.values[parts.observable]).sum() / equations.total_weight))
+
+
 def free_directions(equations: NormalEquations, parts: Spectrum) -> tuple[FreeDirection, ...]:
     """Name the unobservable directions, translations first where the two can be told apart."""
     free = ~parts.observable

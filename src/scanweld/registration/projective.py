@@ -17,7 +17,14 @@ from scanweld.geometry import se3
 from scanweld.geometry.depth import SurfaceLevel, intrinsics_array
 from scanweld.parallel import run_ranges
 from scanweld.registration import kernels
-from scanweld.registration.gauss_newton import NormalEquations, Spectrum, free_directions, solve, spectrum
+from scanweld.registration.gauss_newton import (
+    NormalEquations,
+    Spectrum,
+    free_directions,
+    solve,
+    spectrum,
+    standard_deviation,
+)
 from scanweld.registration.result import FreeDirection, RegistrationResult, Status
 from scanweld.registration.verification import Agreement, check_against_depth, noise_directions
 
@@ -250,8 +257,10 @@ def _descend(
             end.T_target_source = se3.exp(xi) @ end.T_target_source
             turn = float(np.linalg.norm(xi[3:]))
             motion = float(np.linalg.norm(xi[:3] + np.cross(xi[3:], end.centroid_m))) + end.radius_m * turn
-            # A coarse level need only hand over a start within its pixel size.
-            if motion < config.step_m * 4**level:
+            # A step within half a standard deviation of the estimate is noise. A coarse level need only hand over a
+            # start within its pixel size.
+            accuracy = 0.5 * standard_deviation(step.equations, end.parts)
+            if motion < max(config.step_m, accuracy) * 4**level:
                 end.converged = True
                 break
     return end
