@@ -257,10 +257,10 @@ def _descend(
             end.T_target_source = se3.exp(xi) @ end.T_target_source
             turn = float(np.linalg.norm(xi[3:]))
             motion = float(np.linalg.norm(xi[:3] + np.cross(xi[3:], end.centroid_m))) + end.radius_m * turn
-            # A step within half a standard deviation of the estimate is noise. A coarse level need only hand over a
-            # start within its pixel size.
-            accuracy = 0.5 * standard_deviation(step.equations, end.parts)
-            if motion < max(config.step_m, accuracy) * 4**level:
+            # On the finest level a step within half a standard deviation of the estimate is noise. A coarse level need
+            # only hand over a start within its pixel size.
+            noise = 0.5 * standard_deviation(step.equations, end.parts) if level == 0 else 0.0
+            if motion < max(config.step_m * 4**level, noise):
                 end.converged = True
                 break
     return end
