@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from scanweld.arrays import ROTATION_TOLERANCE, as_points, as_transform, finite_rows
+from scanweld.arrays import ROTATION_TOLERANCE, as_colors, as_points, as_transform, finite_rows
 from scanweld.errors import InvalidInputError
 from scanweld.geometry import se3
 
@@ -31,19 +33,67 @@ def test_points_from_lists_and_none_at_all() -> None:
     ("points", "words"),
     [
         ([1, 2, 3], r"expected shape \(N, 2 or 3\), got \(3,\)"),
-        (np.zeros((5, 4)), r"got \(5, 4\)$"),
-        (np.zeros((3, 100)), r"did you mean cloud[.]T\?"),
-        ([["a", "b"]], "expected numbers"),
-        (np.zeros((2, 3), dtype=complex), "expected numbers"),
-        (np.zeros((2, 3), dtype=bool), "expected numbers"),
-        ([[1, 2], [3]], "not a rectangular array"),
-        (np.zeros((2, 3, 1)), "expected shape"),
+        ([1, 2, 3], r"a single point is cloud\[None\]$"),
+        (np.zeros(7), r"got \(7,\)$"),
+        (7.0, r"got \(\)$"),
+        (np.zeros((5, 4)), r"got \(5, 4\); if the first columns are the coordinates: cloud\[:, :3\]$"),
+        (np.zeros((5, 1)), r"got \(5, 1\)$"),
+        (np.zeros((3, 1000)), r"got \(3, 1000\); did you mean cloud[.]T\?"),
+        (np.zeros((2, 3, 1)), r"got \(2, 3, 1\)$"),
+        (np.zeros((480, 640, 3)), r"an organised cloud is cloud[.]reshape\(-1, 3\)$"),
+        ([["a", "b"]], "expected real numbers, got dtype <U1$"),
+        (np.zeros((2, 3), dtype=complex), "got dtype complex128, complex numbers: numpy.stack"),
+        (np.zeros((2, 3), dtype=bool), r"got dtype bool, a mask: select rows with it, points\[mask\]$"),
+        (np.ones((2, 3), dtype=object), r"got dtype object; if all are numbers: numpy.asarray\(points, dtype=float\)$"),
+        ([[1, 2], [3]], r"not a rectangular array of numbers \(rows differ in length\)$"),
+        (None, "expected real numbers, got None$"),
+        ({"x": 1}, "expected real numbers, got one dict$"),
+        ("scan.ply", r"got one str; a file is read by read_points\(path\)$"),
+        (Path("scan.ply"), r"got one \w+; a file is read by read_points\(path\)$"),
     ],
 )
 def test_what_is_no_point_set(points: object, words: str) -> None:
     with pytest.raises(InvalidInputError, match=words) as caught:
         as_points(points, "cloud")  # type: ignore[arg-type]
     assert str(caught.value).startswith("cloud: ")
+
+
+def test_masked_entries_become_nan() -> None:
+    points = np.ma.masked_less(np.arange(6).reshape(3, 2), 1)
+    np.testing.assert_array_equal(as_points(points), [[np.nan, 1], [2, 3], [4, 5]])
+    np.testing.assert_array_equal(as_points(np.ma.masked_array([[1, 2]], mask=False)), [[1, 2]])
+
+
+def test_a_signalling_nan_is_a_nan() -> None:
+    """0x7F800001: a NaN whose conversion to float64 raises the processor's invalid flag."""
+    points = np.array([[0x7F800001, 0x3F800000]], np.uint32).view(np.float32)
+    np.testing.assert_array_equal(as_points(points), [[np.nan, 1]])
+
+
+@pytest.mark.parametrize(
+    ("colors", "expected"),
+    [
+        (np.array([[1, 2, 3]], np.uint8), [[1, 2, 3]]),
+        (np.array([[1, 2, 3, 200]], np.uint8), [[1, 2, 3]]),
+        (np.array([[0, 257, 65535]], np.uint16), [[0, 1, 255]]),
+        ([[-1, 100, 300]], [[0, 100, 255]]),
+        ([[0, 0.5, 1.0]], [[0, 128, 255]]),
+        ([[0, 0.5, 1.5]], [[0, 0, 2]]),
+        ([[np.nan, np.inf, 1.0]], [[0, 0, 255]]),
+        (np.empty((0, 3)), np.empty((0, 3))),
+    ],
+)
+def test_colours_of_every_kind(colors: object, expected: object) -> None:
+    """Half of 255 is 127.5, rounded to even: 128; 0.5 of 0..255 rounds to 0, 1.5 to 2."""
+    whole = as_colors(colors)  # type: ignore[arg-type]
+    assert whole.dtype == np.uint8
+    np.testing.assert_array_equal(whole, expected)
+
+
+@pytest.mark.parametrize("colors", [[1, 2, 3], [[1, 2]], [["red", "green", "blue"]]])
+def test_what_is_no_colour(colors: object) -> None:
+    with pytest.raises(InvalidInputError, match="paint: expected numbers of shape"):
+        as_colors(colors, "paint")  # type: ignore[arg-type]
 
 
 def test_finite_rows_of_several_arrays() -> None:

@@ -84,6 +84,36 @@ def test_the_derivative_of_a_left_perturbation(x):
     np.testing.assert_allclose(numeric, np.hstack([np.eye(3), -se3.hat(moved)]), atol=1e-8)
 
 
+@given(twists(), st.sampled_from([1.0, 1e-3, 0.0]))
+def test_left_jacobian_is_the_change_of_the_logarithm(x, size):
+    """d/de log(exp(e) exp(x)) at e = 0, by central differences."""
+    x = np.concatenate([x[:3], size * x[3:]])
+    T, h = se3.exp(x), 1e-5
+    numeric = np.stack([(se3.log(se3.exp(e) @ T) - se3.log(se3.exp(-e) @ T)) / (2 * h) for e in h * np.eye(6)], axis=1)
+    # Near half a turn the logarithm bends ever more, and the difference quotient with it.
+    np.testing.assert_allclose(se3.left_jacobian_inverse(x), numeric, atol=1e-6 * (1 + np.abs(x).max()))
+
+
+@given(twists())
+def test_left_jacobian_of_rotations_is_the_corner_of_that_of_motions(x):
+    corner = se3.left_jacobian_inverse(x)[3:, 3:]
+    np.testing.assert_allclose(corner @ se3.left_jacobian_so3(x[3:]), np.eye(3), atol=1e-12)
+
+
+@given(twists())
+def test_left_jacobian_leaves_the_own_direction_alone(x):
+    """exp(s x) exp(x) = exp((1 + s) x), so J^-1 x = x exactly."""
+    np.testing.assert_allclose(se3.left_jacobian_inverse(x) @ x, x, atol=1e-11)
+
+
+@pytest.mark.parametrize("angle", [0.5, 0.02])
+def test_left_jacobian_is_continuous_where_its_formulas_change(angle):
+    below, above = (
+        se3.left_jacobian_inverse([1, 2, 3, 0, 0.6 * angle * f, 0.8 * angle * f]) for f in (1 - 1e-12, 1 + 1e-12)
+    )
+    np.testing.assert_allclose(below, above, atol=2e-11)
+
+
 def test_small_and_large_angles_meet_where_the_formulas_change():
     for threshold in (1e-4, 0.02):
         below, above = (se3.exp(np.array([1, 2, 3, 0, 0, threshold * f])) for f in (1 - 1e-9, 1 + 1e-9))

@@ -11,11 +11,13 @@ Importing this module loads Numba (about half a second); `import scanweld` does 
 from __future__ import annotations
 
 import contextlib
+import contextvars
 import hashlib
 import os
 import sys
 import tempfile
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from itertools import pairwise
 from pathlib import Path
@@ -82,11 +84,25 @@ _num_threads = max(
     1, min(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1, 16)
 )
 _pool: ThreadPoolExecutor | None = None
+_inside = threading.local()
+_limit: contextvars.ContextVar[int | None] = contextvars.ContextVar("scanweld_threads", default=None)
 
 
 def get_num_threads() -> int:
     """Number of threads that :func:`run_ranges` uses."""
-    return _num_threads
+    return _limit.get() or _num_threads
+
+
+@contextlib.contextmanager
+def limited_threads(count: int | None) -> Iterator[None]:
+    """Use `count` threads within the block, in this thread of the caller only; None changes nothing."""
+    if count is not None and count < 1:
+        raise InvalidInputError(f"num_threads: expected at least one thread, got {count}")
+    token = _limit.set(count if count is not None else _limit.get())
+    try:
+        yield
+    finally:
+        _limit.reset(token)
 
 
 def set_num_threads(count: int) -> None:
@@ -107,20 +123,24 @@ def split_range(count: int, parts: int) -> list[tuple[int, int]]:
     return list(pairwise(bounds))
 
 
-def run_ranges(count: int, body: Callable[[int, int], object]) -> None:
+def run_ranges(count: int, body: Callable[[int, int], object], *, grain: int = 1) -> None:
     """Call `body(start, stop)` on contiguous ranges that cover range(count), one range a thread.
+
+    `grain`: a thread gets at least so many, or waking it costs more than it saves.
 
     The caller's thread takes the first range. What `body` writes for index i must depend on i alone.
     """
     global _pool
     if count <= 0:
         return
-    ranges = split_range(count, _num_threads)
-    if len(ranges) == 1:
+    ranges = split_range(count, min(get_num_threads(), max(1, count // grain)))
+    if len(ranges) == 1 or getattr(_inside, "pool", False):  # a worker that waited for workers could wait for ever
         body(0, count)
         return
     if _pool is None:
-        _pool = ThreadPoolExecutor(max_workers=_num_threads - 1, thread_name_prefix="scanweld")
+        _pool = ThreadPoolExecutor(
+            max_workers=max(_num_threads - 1, 1), thread_name_prefix="scanweld", initializer=_enter_pool
+        )
     futures: list[Future[object]] = [_pool.submit(body, start, stop) for start, stop in ranges[1:]]
     try:
         body(*ranges[0])
@@ -128,6 +148,10 @@ def run_ranges(count: int, body: Callable[[int, int], object]) -> None:
         wait(futures)  # nobody writes into the caller's arrays once it goes on
     for future in futures:
         future.result()
+
+
+def _enter_pool() -> None:
+    _inside.pool = True
 
 
 def _forget_pool() -> None:

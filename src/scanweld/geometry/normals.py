@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,10 +10,10 @@ from scipy.spatial import cKDTree
 
 from scanweld.arrays import Float64, as_points
 from scanweld.errors import InvalidInputError
+from scanweld.geometry.neighbours.kd_tree import KdTree, NeighbourIndex, build_index
 
 NEIGHBOURS = 20
-_CHUNK = 8192  # rows at a time: k neighbours of a million points at once would take 480 MB
-_COLLINEAR = 1e-8  # second eigenvalue over the first: a line 1e-4 thin has no normal
+_LISTED = 8192  # rows at a time: k neighbours of a million points at once would take 480 MB
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,12 +77,13 @@ def fit_surfaces(
     neighbours: int = NEIGHBOURS,
     at: Float64 | None = None,
     tree: cKDTree | None = None,
+    index: NeighbourIndex | None = None,
     num_threads: int | None = None,
 ) -> SurfaceFit:
     """Fit a plane through the neighbours of each point, or of each place `at` (M, D).
 
     The variance of a normal is that of a regression slope, lambda_0 / (k lambda_1) with the eigenvalues of
-    the neighbours' covariance in ascending order.
+    the neighbours' covariance in ascending order. `tree` or `index` is one of the same points, where there is one.
     """
     count, dimension = points_m.shape
     if count < dimension or neighbours < dimension:
@@ -93,13 +92,11 @@ def fit_surfaces(
         )
     if not np.isfinite(points_m).all():
         raise InvalidInputError("normals: some points are not finite; drop them first (PointCloud.finite())")
-    places = points_m if at is None else at
     k = min(neighbours, count)
-    values, vectors = _eigen(points_m, places, tree, k, num_threads)
-    flat = values[:, 1] > (_COLLINEAR * values[:, -1] if dimension == 3 else 0.0)
-    normals = np.where(flat[:, None], vectors[:, :, 0], 0.0)
-    variance = np.where(flat, values[:, 0] / (k * np.where(flat, values[:, 1], 1.0)), 0.0)
-    return SurfaceFit(normals, np.maximum(variance, 0.0))
+    normals, values = _fit(_index_of(points_m, tree, index, num_threads), at, k, num_threads)
+    flat = normals.any(axis=1)
+    variance = values[:, 0] / (k * np.where(flat, values[:, 1], 1.0))
+    return SurfaceFit(normals, np.where(flat, variance, 0.0))
 
 
 def flatness(
@@ -108,29 +105,53 @@ def flatness(
     at: Float64,
     neighbours: int,
     tree: cKDTree | None = None,
+    index: NeighbourIndex | None = None,
     num_threads: int | None = None,
 ) -> Float64:
     """Return the smallest over the largest eigenvalue of the neighbourhoods of places: 0 flat, 1 round."""
-    values, _ = _eigen(points_m, at, tree, min(neighbours, len(points_m)), num_threads)
-    return np.asarray(np.maximum(values[:, 0], 0.0) / np.where(values[:, -1] > 0, values[:, -1], 1.0))
+    k = min(neighbours, len(points_m))
+    _, values = _fit(_index_of(points_m, tree, index, num_threads), at, k, num_threads)
+    return np.asarray(values[:, 0] / np.where(values[:, -1] > 0, values[:, -1], 1.0))
 
 
-def _eigen(
-    points: Float64, places: Float64, tree: cKDTree | None, k: int, num_threads: int | None
-) -> tuple[Float64, Float64]:
-    """Ascending eigenvalues (M, D) and vectors (M, D, D) of the covariance of k points near each place."""
-    index = tree if tree is not None else cKDTree(points)
+def _index_of(
+    points: Float64, tree: cKDTree | None, index: NeighbourIndex | None, num_threads: int | None
+) -> NeighbourIndex:
+    if index is not None:
+        return index
+    return build_index(points, num_threads) if tree is None else KdTree(points, num_threads, tree=tree)
+
+
+def _fit(index: NeighbourIndex, at: Float64 | None, k: int, num_threads: int | None) -> tuple[Float64, Float64]:
+    """Normals and ascending eigenvalues (M, D) of the covariance of the k points nearest to each place."""
+    from scanweld.geometry.neighbours.grid import HashGrid, embedded  # loads Numba
+    from scanweld.geometry.surfaces import kernels
+    from scanweld.parallel import limited_threads, run_ranges
+
+    points = index.points
     dimension = points.shape[1]
-    values = np.empty((len(places), dimension))
-    vectors = np.empty((len(places), dimension, dimension))
+    count = len(points if at is None else at)
+    normals, values = np.empty((count, dimension)), np.empty((count, dimension))
+    rest = np.arange(count)
+    with limited_threads(num_threads):
+        if isinstance(index, HashGrid):
+            grid = index.suited_to(k)
+            queries = grid.rows if at is None else grid.arranged(at)
 
-    def decompose(start: int) -> None:
-        rows = slice(start, start + _CHUNK)
-        _, near = index.query(places[rows], k=k)
-        local = points[near.reshape(-1, k)]
-        local -= local.mean(axis=1, keepdims=True)  # centred first: offsets of 1e6 cost nothing
-        values[rows], vectors[rows] = np.linalg.eigh(np.swapaxes(local, 1, 2) @ local / k)
+            def fit(first: int, last: int) -> None:
+                start, stop = first * kernels.CHUNK, min(last * kernels.CHUNK, count)
+                kernels.fit_nearest(
+                    queries, start, stop, k, dimension, grid.rows, grid.starts, grid.lattice, normals, values
+                )
 
-    with ThreadPoolExecutor(max_workers=num_threads or os.cpu_count()) as pool:
-        list(pool.map(decompose, range(0, len(places), _CHUNK)))
-    return values, vectors
+            run_ranges(-(-count // kernels.CHUNK), fit)
+            rest = np.flatnonzero(values[:, 0] < 0)
+            if len(rest):
+                index = index.tree
+        space = embedded(points)
+        for start in range(0, len(rest), _LISTED):
+            rows = rest[start : start + _LISTED]
+            places = np.ascontiguousarray((points if at is None else at)[rows])
+            _, near = index.k_nearest(places, k)
+            kernels.fit_listed(embedded(places), near, space, dimension, rows, normals, values)
+    return normals, values

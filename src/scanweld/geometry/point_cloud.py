@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from scanweld.arrays import Array, Float64, Int64, UInt8, as_points, finite_rows
+from scanweld.arrays import Array, Float64, Int32, Int64, UInt8, as_points, finite_rows
 from scanweld.errors import InvalidInputError
+from scanweld.geometry.neighbours.kd_tree import NeighbourIndex
 
-_SPACING_SAMPLE = 4000  # the median of so many distances is known to about 2 %
+_FIRST_TABLE = 1 << 15  # slots for 16384 voxels; stays in the second-level cache
+_SPACING_SAMPLE = 1500  # the median of so many distances is known to about 3 %
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,8 +71,9 @@ class PointCloud:
 
     def finite(self) -> PointCloud:
         """Return the cloud without the rows that hold a NaN or an infinity."""
-        mask = finite_rows(self.points_m, self.normals)
-        return self if mask.all() else self.select(mask)
+        if np.isfinite(self.points_m).all() and (self.normals is None or np.isfinite(self.normals).all()):
+            return self
+        return self.select(finite_rows(self.points_m, self.normals))
 
     def transformed(self, T_new_old: npt.ArrayLike, scale: float = 1.0) -> PointCloud:
         """Return the cloud moved by x_new = scale R x_old + t; normals are rotated."""
@@ -113,53 +117,108 @@ def voxel_downsample(cloud: PointCloud, voxel_m: float) -> PointCloud:
     cloud = cloud.finite()
     if len(cloud) == 0:
         return cloud
-    origin = cloud.points_m.min(axis=0)
-    local = cloud.points_m - origin
-    if local.max() / voxel_m >= 2.0**53:
-        raise InvalidInputError(f"voxel: {voxel_m} m is too small for a cloud {local.max():.3g} m wide")
-    order, starts = _group(np.floor(local / voxel_m).astype(np.int64))
-    counts = np.diff(np.append(starts, len(order)))[:, None]
+    from scanweld.geometry.voxels import kernels  # loads Numba
 
-    def mean(values: Array) -> Float64:
-        return np.asarray(np.add.reduceat(values[order].astype(np.float64), starts, axis=0) / counts)
+    points = cloud.points_m
+    origin = np.array([points[:, axis].min() for axis in range(cloud.dimension)])
+    width = np.array([points[:, axis].max() for axis in range(cloud.dimension)]) - origin
+    if width.max() / voxel_m >= 2.0**53:
+        raise InvalidInputError(f"voxel: {voxel_m} m is too small for a cloud {width.max():.3g} m wide")
+    labels, firsts, order = _label(points, origin, width, voxel_m)
+
+    def mean(values: Array, about: Float64) -> Float64:
+        sums = np.zeros((len(order), values.shape[1]))
+        counts = np.zeros(len(order), dtype=np.int32)
+        kernels.add_rows(np.ascontiguousarray(values, dtype=np.float64), about, labels, sums, counts)
+        return np.asarray((sums / counts[:, None])[order])
 
     normals = colors = None
     if cloud.normals is not None:
-        total = mean(cloud.normals)
+        total = mean(cloud.normals, np.zeros(cloud.dimension))
         length = np.linalg.norm(total, axis=1, keepdims=True)
         cancelled = length < 1e-6  # opposite normals: their mean says nothing, the first one at least exists
-        normals = np.where(cancelled, cloud.normals[order[starts]], total / np.where(cancelled, 1.0, length))
+        normals = np.where(cancelled, cloud.normals[firsts[order]], total / np.where(cancelled, 1.0, length))
     if cloud.colors is not None:
-        colors = np.rint(mean(cloud.colors)).astype(np.uint8)
-    return PointCloud(mean(local) + origin, normals, colors)
+        colors = np.rint(mean(cloud.colors, np.zeros(3))).astype(np.uint8)
+    return PointCloud(mean(points, origin) + origin, normals, colors)
 
 
-def _group(cells: Int64) -> tuple[Int64, Int64]:
-    """Return the order that sorts rows of integers, stably, and where each run of equal rows starts."""
-    sizes = cells.max(axis=0) + 1
-    if float(np.prod(sizes.astype(np.float64))) < 2.0**62:
-        key = np.ravel_multi_index(tuple(cells.T), tuple(sizes))
-        order = np.argsort(key, kind="stable")
-        changed = np.diff(key[order]) != 0
-    else:
-        order = np.lexsort(cells.T[::-1])
-        changed = (np.diff(cells[order], axis=0) != 0).any(axis=1)
-    return order, np.concatenate([[0], np.flatnonzero(changed) + 1])
+def voxel_downsample_each(
+    clouds: Sequence[PointCloud], voxel_m: float, *, num_threads: int | None = None
+) -> list[PointCloud]:
+    """Thin several clouds by :func:`voxel_downsample`, each in a thread of its own."""
+    from scanweld.parallel import limited_threads, run_ranges
+
+    thinned = list(clouds)
+
+    def thin(start: int, stop: int) -> None:
+        thinned[start:stop] = [voxel_downsample(cloud, voxel_m) for cloud in clouds[start:stop]]
+
+    with limited_threads(num_threads):
+        run_ranges(len(thinned), thin)
+    return thinned
 
 
-def median_spacing(points_m: npt.ArrayLike, tree: cKDTree | None = None) -> float:
+def _label(points: Float64, origin: Float64, width: Float64, voxel_m: float) -> tuple[Int32, Int64, Int64]:
+    """Label of each point's voxel, first point of each label, and the order of labels that is row-major in space."""
+    from scanweld.geometry.voxels import kernels
+
+    sizes = np.floor(width / voxel_m) + 1
+    if float(np.prod(sizes)) >= 2.0**62:
+        return _label_by_sorting(np.floor((points - origin) / voxel_m).astype(np.int64))
+    labels = np.empty(len(points), dtype=np.int32)
+    keys, firsts = np.empty(len(points), dtype=np.int64), np.empty(len(points), dtype=np.int64)
+    row = count = 0
+    size = _FIRST_TABLE
+    while row < len(points):
+        table = np.full(size, -1, dtype=np.int32)
+        kernels.fill_table(keys, count, table)
+        row, count = kernels.label_points(
+            points, row, origin, float(voxel_m), sizes.astype(np.int64), table, labels, keys, firsts, count
+        )
+        size *= 4
+    return labels, firsts[:count], np.argsort(keys[:count])
+
+
+def _label_by_sorting(cells: Int64) -> tuple[Int32, Int64, Int64]:
+    """As :func:`_label`, for cells (N, D) of which there are more than an integer can number."""
+    order = np.lexsort(cells.T[::-1])
+    changed = np.concatenate([[False], (np.diff(cells[order], axis=0) != 0).any(axis=1)])
+    labels = np.empty(len(cells), dtype=np.int32)
+    labels[order] = np.cumsum(changed)
+    firsts = order[np.concatenate([[0], np.flatnonzero(changed)])]
+    return labels, firsts, np.arange(len(firsts))
+
+
+def grid_order(points_m: npt.ArrayLike) -> Int64:
+    """Return an order (N,) of points (N, D), finite, in which neighbours follow each other: searches for points so
+    ordered take about half the time."""
+    points = as_points(points_m, "points_m")
+    if len(points) == 0:
+        return np.zeros(0, dtype=np.int64)
+    from scanweld.geometry.neighbours.grid import HashGrid  # loads Numba
+
+    return HashGrid(points).order
+
+
+def median_spacing(
+    points_m: npt.ArrayLike, tree: cKDTree | None = None, *, index: NeighbourIndex | None = None
+) -> float:
     """Return the median distance [m] from a point to its nearest distinct neighbour, 0 where there is none.
 
     Parameters
     ----------
     points_m : (N, D), finite
-    tree : a k-d tree of the same points, where the caller has one
+    tree, index : a k-d tree or another index of the same points, where the caller has one
     """
     points = np.asarray(points_m, dtype=np.float64)
     if len(points) < 2:
         return 0.0
     stride = max(1, len(points) // _SPACING_SAMPLE)
-    distances, _ = (tree or cKDTree(points)).query(points[::stride], k=2)
+    if index is not None:
+        distances, _ = index.k_nearest(points[::stride], 2)
+    else:
+        distances, _ = (tree or cKDTree(points)).query(points[::stride], k=2)
     spacing = float(np.median(distances[:, 1]))
     if spacing > 0:
         return spacing

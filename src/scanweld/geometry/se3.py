@@ -8,6 +8,8 @@ Source: J. Solà et al., "A micro Lie theory for state estimation in robotics", 
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import numpy.typing as npt
 
@@ -77,15 +79,7 @@ def log(transform: npt.ArrayLike) -> Float64:
     """Return the twists (..., 6) of transforms (..., 4, 4) (Solà eq. 173); rotation angle in [0, pi]."""
     T = np.asarray(transform, dtype=np.float64)
     phi = log_so3(T[..., :3, :3])
-    angle = np.linalg.norm(phi, axis=-1)[..., None, None]
-    small = angle < 0.02
-    s = np.where(small, 1.0, angle)
-    # V^-1 = I - hat/2 + k hat^2, k = (1 - (t/2) cot(t/2)) / t^2 (Solà eq. 146)
-    with np.errstate(divide="ignore"):
-        cotangent = 1 / np.tan(s / 2)
-    k = np.where(small, 1 / 12 + angle**2 / 720 + angle**4 / 30240, (1 - s / 2 * cotangent) / s**2)
-    matrix = hat(phi)
-    rho = (np.eye(3) - matrix / 2 + k * (matrix @ matrix)) @ T[..., :3, 3, None]
+    rho = _left_jacobian_so3_inverse(phi) @ T[..., :3, 3, None]
     return np.concatenate([rho[..., 0], phi], axis=-1)
 
 
@@ -110,6 +104,68 @@ def adjoint(transform: npt.ArrayLike) -> Float64:
     result[..., 3:, 3:] = rotation
     result[..., :3, 3:] = hat(T[..., :3, 3]) @ rotation
     return result
+
+
+def left_jacobian_so3(phi: npt.ArrayLike) -> Float64:
+    """Return J (..., 3, 3) with exp(phi + d) = exp(J d) exp(phi) to first order in d (Solà eq. 145)."""
+    v = np.asarray(phi, dtype=np.float64)
+    _, b, c = _coefficients(v)
+    matrix = hat(v)
+    return np.asarray(np.eye(3) + b * matrix + c * (matrix @ matrix))
+
+
+def left_jacobian_inverse(xi: npt.ArrayLike) -> Float64:
+    """Return J^-1 (..., 6, 6) with log(exp(d) exp(xi)) = xi + J^-1 d to first order in d, |phi| < 2 pi.
+
+    J = [[A, Q], [0, A]] with A of :func:`left_jacobian_so3`, so J^-1 = [[A^-1, -A^-1 Q A^-1], [0, A^-1]]
+    (Solà eq. 179, 180; the coefficients are those of T. D. Barfoot, "State estimation for robotics", 2017, eq. 7.86).
+    """
+    twist = np.asarray(xi, dtype=np.float64)
+    rho, phi = twist[..., :3], twist[..., 3:]
+    inverse_so3 = _left_jacobian_so3_inverse(phi)
+    c1, c2, c3 = _second_coefficients(phi)
+    r, p = hat(rho), hat(phi)
+    pr, rp = p @ r, r @ p
+    prp = pr @ p
+    q = r / 2 + c1 * (pr + rp + prp) + c2 * (p @ pr + rp @ p - 3 * prp) + c3 * (prp @ p + p @ prp)
+    result = np.zeros((*twist.shape[:-1], 6, 6))
+    result[..., :3, :3] = inverse_so3
+    result[..., 3:, 3:] = inverse_so3
+    result[..., :3, 3:] = -inverse_so3 @ q @ inverse_so3
+    return result
+
+
+def _left_jacobian_so3_inverse(phi: Float64) -> Float64:
+    """I - hat/2 + k hat^2, k = (1 - (t/2) cot(t/2)) / t^2 (Solà eq. 146)."""
+    angle = np.linalg.norm(phi, axis=-1)[..., None, None]
+    small = angle < 0.02
+    s = np.where(small, 1.0, angle)
+    with np.errstate(divide="ignore"):
+        cotangent = 1 / np.tan(s / 2)
+    k = np.where(small, 1 / 12 + angle**2 / 720 + angle**4 / 30240, (1 - s / 2 * cotangent) / s**2)
+    matrix = hat(phi)
+    return np.asarray(np.eye(3) - matrix / 2 + k * (matrix @ matrix))
+
+
+def _second_coefficients(phi: Float64) -> tuple[Float64, Float64, Float64]:
+    """c1 = (t - sin t) / t^3, c2 = (t^2 / 2 + cos t - 1) / t^4 and
+    c3 = (c2 + 3 (t - sin t - t^3 / 6) / t^5) / 2 with t = |phi|, shaped (..., 1, 1)."""
+    t = np.linalg.norm(phi, axis=-1)[..., None, None]
+    small = t < 0.5  # the closed forms cancel below; seven terms of the series are exact to 1e-16 there
+    s = np.where(small, 1.0, t)
+    square = np.where(small, t, 0.0) ** 2
+
+    def series(first: int) -> Float64:
+        """sum over k of (-t^2)^k / (2 k + first)!"""
+        total = np.zeros_like(square)
+        for k in reversed(range(7)):
+            total = total * -square + 1 / math.factorial(2 * k + first)
+        return total
+
+    c1 = np.where(small, series(3), (s - np.sin(s)) / s**3)
+    c2 = np.where(small, series(4), (s**2 / 2 + np.cos(s) - 1) / s**4)
+    d = np.where(small, -series(5), (s - np.sin(s) - s**3 / 6) / s**5)
+    return c1, c2, (c2 + 3 * d) / 2
 
 
 def interpolate(T_a: npt.ArrayLike, T_b: npt.ArrayLike, fraction: npt.ArrayLike) -> Float64:

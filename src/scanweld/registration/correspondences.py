@@ -3,33 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from scanweld.arrays import Float64, Int64
+from scanweld.geometry.neighbours import KdTree, NeighbourIndex
 
-
-class NeighbourIndex(Protocol):
-    """Finds the nearest target point of each query; a k-d tree here, anything else that answers the same."""
-
-    def nearest(self, points: Float64, max_distance: float) -> tuple[Float64, Int64]:
-        """Return distances (N,) and indices (N,); inf and the number of targets where none is near enough."""
-
-
-class KdTree:
-    """k-d tree of the target points (M, D), M >= 1; the answer does not depend on the number of threads."""
-
-    def __init__(self, points: Float64, num_threads: int | None = None) -> None:
-        self.tree = cKDTree(points)
-        self._workers = num_threads or -1
-
-    def nearest(self, points: Float64, max_distance: float) -> tuple[Float64, Int64]:
-        """Return the nearest target of each point within `max_distance`, the bound included."""
-        bound = np.nextafter(max_distance, np.inf)
-        distances, indices = self.tree.query(points, distance_upper_bound=bound, workers=self._workers)
-        return distances, indices.astype(np.int64)
+__all__ = ["Correspondences", "KdTree", "NeighbourIndex", "find_correspondences"]
 
 
 @dataclass(frozen=True, slots=True)

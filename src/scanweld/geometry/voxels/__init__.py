@@ -1,0 +1,1 @@
+"""Points grouped by voxel: the compiled part of :func:`scanweld.geometry.point_cloud.voxel_downsample`."""
