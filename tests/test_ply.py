@@ -9,6 +9,8 @@ import time
 import numpy as np
 import plyfile
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from scanweld.errors import FileFormatError, OutputError
 from scanweld.geometry.point_cloud import PointCloud
@@ -136,11 +138,11 @@ def test_truncated_files(tmp_path, keep):
         (b"ply\nformat ascii 1.0\nproperty float x\nend_header\n", "line 3"),
         (b"ply\nformat ascii 1.0\nelement vertex 1\nproperty half x\nend_header\n1\n", "line 4"),
         (b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float a\nend_header\n1\n", "no x and y"),
-        (b"ply\nformat ascii 1.0\nelement face 0\nproperty float x\nend_header\n", "not a readable PLY"),
+        (b"ply\nformat ascii 1.0\nelement face 0\nproperty float x\nend_header\n", "no vertices"),
         (b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nend_header\none two\n",
-         "not a readable PLY"),
+         "line 7: expected 2 numbers, got 'one two'"),
         (b"ply\nformat morse 1.0\nelement vertex 1\nproperty float x\nproperty float y\nend_header\n1 22222222\n",
-         "not a readable PLY"),
+         "line 2 of the PLY header is wrong: 'format morse 1.0'"),
     ],
 )  # fmt: skip
 def test_files_that_are_no_ply(tmp_path, content, words):
@@ -175,3 +177,145 @@ def test_columns_that_cannot_be_written(tmp_path, columns, words):
 def test_a_folder_that_does_not_exist(tmp_path):
     with pytest.raises(OutputError, match="cannot be written"):
         write_ply(tmp_path / "no" / "a.ply", PointCloud(POINTS))
+
+
+LISTS = [
+    ("element face 3", "property list uchar int vertex_indices"),
+    (
+        "element vertex 3",
+        "property double x",
+        "property list int double seen_from",
+        "property float y",
+        "property short z",
+    ),
+]
+
+
+@pytest.mark.parametrize(("encoding", "order"), [("binary_little_endian", "<"), ("binary_big_endian", ">")])
+def test_lists_before_and_among_the_vertices(tmp_path, encoding, order):
+    """Rows of different length, in an element before the vertices and in the vertices themselves."""
+    header = "\n".join(["ply", f"format {encoding} 1.0", *LISTS[0], *LISTS[1], "end_header", ""]).encode()
+    faces = struct.pack(order + "B3iBB2i", 3, 0, 1, 1, 0, 2, 2, 0)
+    vertices = struct.pack(order + "difh", 1e6 + 0.1, 0, 2, 3) + struct.pack(order + "di3dfh", 4, 3, 7, 8, 9, 5, 6)
+    (tmp_path / "a.ply").write_bytes(header + faces + vertices + struct.pack(order + "didfh", 7, 1, 1, 8, 9))
+    np.testing.assert_array_equal(read_ply(tmp_path / "a.ply").points_m, [[1e6 + 0.1, 2, 3], [4, 5, 6], [7, 8, 9]])
+
+
+def test_lists_in_text(tmp_path):
+    body = "3 0 1 1\n0\n\n2 2 0\n1000000.1 0 2 3\n4 3 7 8 9 5 6\n\n7 1 1 8 9\n"
+    (tmp_path / "a.ply").write_text("\n".join(["ply", "format ascii 1.0", *LISTS[0], *LISTS[1], "end_header", body]))
+    np.testing.assert_array_equal(read_ply(tmp_path / "a.ply").points_m, [[1e6 + 0.1, 2, 3], [4, 5, 6], [7, 8, 9]])
+
+
+def test_what_follows_the_vertices_is_not_looked_at(tmp_path):
+    header = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\n"
+    header += "element face 2\nproperty list uchar int vertex_indices\nend_header\n"
+    (tmp_path / "a.ply").write_text(header + "1 2\nnot a face\nnor this\n")
+    np.testing.assert_array_equal(read_ply(tmp_path / "a.ply").points_m, [[1, 2]])
+
+
+@pytest.mark.parametrize("newline", ["\r\n", "\r"])
+def test_other_ends_of_line(tmp_path, newline):
+    """The first byte of a binary body may look like the second half of an end of line."""
+    lines = ["ply", "format binary_big_endian 1.0", "element vertex 1", "property uchar x", "property uchar y"]
+    content = newline.join([*lines, "end_header", ""]).encode() + b"\x0a\x0d"
+    (tmp_path / "a.ply").write_bytes(content)
+    np.testing.assert_array_equal(read_ply(tmp_path / "a.ply").points_m, [[10, 13]])
+    text = newline.join(["ply", "format ascii 1.0", *lines[2:], "end_header", "1 2", ""])
+    (tmp_path / "b.ply").write_bytes(text.encode())
+    np.testing.assert_array_equal(read_ply(tmp_path / "b.ply").points_m, [[1, 2]])
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian", "binary_big_endian"])
+def test_no_vertices_at_all(tmp_path, encoding):
+    lines = ["ply", f"format {encoding} 1.0", "element vertex 0", *(f"property float {a}" for a in "xyz"), "end_header"]
+    (tmp_path / "a.ply").write_text("\n".join([*lines, ""]))
+    assert read_ply(tmp_path / "a.ply").points_m.shape == (0, 3)
+
+
+VERTEX = "ply\nformat {} 1.0\nelement vertex 2\nproperty list {} int around\n"
+VERTEX += "property uchar x\nproperty uchar y\nend_header\n"
+
+
+@pytest.mark.parametrize(
+    ("kind", "body", "words"),
+    [
+        ("uint", struct.pack("<I", 2**32 - 1) + bytes(60), "ends after 0"),
+        ("int", struct.pack("<i", -1) + bytes(60), "the list 'around' of vertex 0 has -1 entries"),
+        ("uchar", b"\x00\x01\x02" + b"\x03" + bytes(12) + b"\x01", "ends after 1"),
+        ("uchar", b"\x01" + bytes(4) + b"\x01\x02" + b"\x02", "ends after 1"),
+    ],
+)
+def test_lists_that_lie(tmp_path, kind, body, words):
+    (tmp_path / "a.ply").write_bytes(VERTEX.format("binary_little_endian", kind).encode() + body)
+    with pytest.raises(FileFormatError, match=rf"a\.ply.*{words}"):
+        read_ply(tmp_path / "a.ply")
+
+
+@pytest.mark.parametrize(
+    ("body", "words"),
+    [
+        ("2 0 0 1 2\n3 0 0 1 2\n", "line 9: not a vertex"),
+        ("2 0 0 1 2\n-1 0 0 1 2\n", "line 9: not a vertex"),
+        ("0 1 2\n\n0 1 256\n", "'y' has values outside 0..255"),
+        ("0 1 2\n\n0 1 y\n", "line 10: expected 2 numbers"),
+        ("12 1 2 3 4 5 6 7 8 9 10 11 12 13 14\n", "ends after 1"),
+    ],
+)
+def test_text_that_does_not_fit_its_header(tmp_path, body, words):
+    (tmp_path / "a.ply").write_text(VERTEX.format("ascii", "uchar") + body)
+    with pytest.raises(FileFormatError, match=rf"a\.ply.*{words}"):
+        read_ply(tmp_path / "a.ply")
+
+
+@pytest.mark.parametrize(
+    ("lines", "words"),
+    [
+        (["element vertex 1_0", "property float x"], "line 3"),
+        (["element vertex 99999999999999999999999", "property float x"], "line 3"),
+        (["element vertex 1", "property list float int a"], "line 4"),
+        (["element vertex 1", "property float"], "line 4"),
+        (["element vertex 1", "property float x", "property float x"], "two properties of one name"),
+        (["element vertex 1000000000000"], "no properties"),
+        (["element camera 1000000000000", "element vertex 0", "property float x"], "no properties"),
+    ],
+)
+def test_headers_that_make_no_sense(tmp_path, lines, words):
+    content = "\n".join(["ply", "format ascii 1.0", *lines, "end_header", "1 2", ""])
+    for text in (content, content.replace("ascii", "binary_little_endian")):
+        (tmp_path / "a.ply").write_text(text)
+        with pytest.raises(FileFormatError, match=rf"a\.ply.*{words}"):
+            read_ply(tmp_path / "a.ply")
+
+
+def test_garbage_and_other_encodings_of_text(tmp_path):
+    text = "ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nproperty float y\nend_header\n"
+    for content in (text.encode("utf-16"), b"ply" + bytes(range(256)) * 300, bytes(5000), b"ply\n" + bytes(200_000)):
+        (tmp_path / "a.ply").write_bytes(content)
+        with pytest.raises(FileFormatError, match=r"a\.ply"):
+            read_ply(tmp_path / "a.ply")
+
+
+@given(st.integers(0, 2**32 - 1), st.booleans(), st.sampled_from(["=", "<", ">"]), st.integers(0, 12))
+def test_what_another_program_writes_is_read(tmp_path_factory, seed, with_lists, byte_order, count):
+    """plyfile writes the same table in text or either byte order; coordinates are eighths, exact in every type.
+
+    Not lists with big-endian: plyfile 1.1 writes the single values of such rows in the machine's order.
+    """
+    with_lists = with_lists and byte_order != ">"
+    rng = np.random.default_rng(seed)
+    dtype = [("a", "i2"), ("x", "f8"), ("y", "f4"), ("z", "f8"), *([("l", "O")] if with_lists else []), ("red", "u1"),
+             ("green", "u1"), ("blue", "u1")]  # fmt: skip
+    table = np.zeros(count, dtype)
+    for axis in "xyz":
+        table[axis] = rng.integers(-1000, 1000, count) / 8
+    for name in ("red", "green", "blue"):
+        table[name] = rng.integers(0, 256, count)
+    if with_lists:
+        table["l"] = [rng.integers(0, 9, k % 4).astype("i4") for k in range(count)]
+    element = plyfile.PlyElement.describe(table, "vertex", val_types={"l": "i4"}, len_types={"l": "u2"})
+    file = tmp_path_factory.mktemp("ply") / "a.ply"
+    plyfile.PlyData([element], text=byte_order == "=", byte_order=byte_order).write(str(file))
+    cloud = read_ply(file)
+    np.testing.assert_array_equal(cloud.points_m, np.stack([table[axis] for axis in "xyz"], axis=1))
+    np.testing.assert_array_equal(cloud.colors, np.stack([table[name] for name in ("red", "green", "blue")], axis=1))
