@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from scanweld.errors import InvalidInputError
 from scanweld.geometry import se3
-from scanweld.registration.closed_form import align_closed_form, fit_horn
+from scanweld.parallel import limited_threads
+from scanweld.registration.closed_form import align_closed_form, fit_horn, fit_pairs, pair_residuals
+from scanweld.registration.closed_form.moments.kernels import CHUNK
 from scanweld.registration.residuals import point_to_point
-from scanweld.registration.result import Status
+from scanweld.registration.result import RegistrationResult, Status
 
 A = np.array([(0, 0), (1, 0), (0, 1), (1, 1), (2, 0.5)])
 B_NOISY = np.array([(2.10, 2.71), (3.01, 3.72), (1.24, 3.79), (1.79, 4.56), (3.04, 4.63)])
@@ -200,15 +202,48 @@ def test_the_motion_comes_back_in_any_dimension(seed, dimension, scale):
         assert result.scale == pytest.approx(scale)
 
 
-@given(st.integers(0, 10**6), st.floats(0, 0.3))
-def test_svd_and_quaternion_agree(seed, noise):
+@given(
+    st.integers(0, 10**6),
+    st.floats(0, 0.2),
+    st.sampled_from(["solid", "planar", "mirrored"]),
+    st.sampled_from([1e-6, 1.0, 1e6]),
+    st.sampled_from(["none", "symmetric", "least_squares"]),
+)
+def test_svd_and_quaternion_agree(seed, noise, kind, unit, scale):
+    """To 1e-12 of the size of the points, wherever the pairs determine the rotation to a hundredth."""
     rng = np.random.default_rng(seed)
-    a = rng.normal(size=(12, 3))
-    b = se3.transform_points(random_motion(rng, 3), a) + noise * rng.normal(size=a.shape)
+    a = rng.normal(size=(12, 3)) * ([1, 1, 0] if kind == "planar" else [3, 2, 1])
+    b = a * [1, 1, -1] if kind == "mirrored" else a
+    b = se3.transform_points(random_motion(rng, 3), b) + noise * rng.normal(size=a.shape)
     w = rng.uniform(0.1, 3, 12)
-    one, other = (align_closed_form(a, b, weights=w, method=m, scale="symmetric") for m in ("svd", "quaternion"))
-    np.testing.assert_allclose(one.T_target_source, other.T_target_source, atol=1e-11)
+    fit = fit_horn(a, b, w)
+    assume(min(fit.curvatures.values()) > 0.01 * sum(fit.singular_values))
+    one, other = (
+        align_closed_form(unit * a, unit * b, weights=w, method=m, scale=scale) for m in ("svd", "quaternion")
+    )
+    np.testing.assert_allclose(one.T_target_source[:3, :3], other.T_target_source[:3, :3], atol=1e-12)
+    np.testing.assert_allclose(one.T_target_source[:3, 3] / unit, other.T_target_source[:3, 3] / unit, atol=1e-12)
+    assert one.scale == pytest.approx(other.scale, rel=1e-12)
     assert one.status is other.status
+
+
+@given(st.integers(0, 10**6), st.integers(2, 7), st.integers(0, 7))
+def test_the_decomposition_is_that_of_lapack(seed, dimension, rank):
+    """W = U S V^T with orthogonal factors and the singular values of LAPACK, whatever the rank."""
+    rng = np.random.default_rng(seed)
+    rank = min(rank, dimension)
+    a = rng.normal(size=(20, rank)) @ rng.normal(size=(rank, dimension)) * 10.0 ** rng.integers(-3, 4)
+    b = rng.normal(size=(20, dimension))
+    fit = fit_horn(a, b)
+    W = (b - b.mean(axis=0)).T @ (a - a.mean(axis=0))
+    size = max(np.abs(W).max(), 1e-300)
+    np.testing.assert_allclose(fit.W / size, W / size, atol=1e-13)
+    np.testing.assert_allclose(fit.U * fit.singular_values @ fit.Vt / size, W / size, atol=1e-13)
+    np.testing.assert_allclose(fit.singular_values / size, np.linalg.svd(W)[1] / size, atol=1e-13)
+    np.testing.assert_allclose(fit.U.T @ fit.U, np.eye(dimension), atol=1e-13)
+    np.testing.assert_allclose(fit.Vt @ fit.Vt.T, np.eye(dimension), atol=1e-13)
+    assert fit.rank == rank
+    assert np.linalg.det(fit.rotation) == pytest.approx(1)
 
 
 @given(st.integers(0, 10**6))
@@ -329,6 +364,138 @@ def test_wrong_shapes_raise(arguments, words):
 def test_wrong_options_raise(options):
     with pytest.raises(InvalidInputError, match=next(iter(options))):
         align_closed_form(A, B_NOISY, **options)
+
+
+class TestManyPairs:
+    """More than one chunk of the kernels, and blocks without a single pair in use."""
+
+    @staticmethod
+    def pairs(count=2 * CHUNK + 700, offset=0.0):
+        rng = np.random.default_rng(5)
+        a = rng.normal(size=(count, 3)) * [3, 2, 1] + offset
+        T = se3.exp([0.1, 0.2, -0.3, 0.5, -0.4, 0.3])
+        b = (a - offset) @ T[:3, :3].T + T[:3, 3] - offset + 0.05 * rng.normal(size=a.shape)
+        a[:1500] = np.nan  # the first blocks are empty
+        b[CHUNK : CHUNK + 40, 1] = np.inf
+        w = rng.uniform(0.5, 2, count)
+        w[5000:6200] = 0
+        return a, b, w
+
+    @pytest.mark.parametrize("offset", [0, 1e6])
+    def test_the_answer_is_that_of_the_formulas(self, offset):
+        """Umeyama's eqs. 34 to 43 in NumPy, of the centred points."""
+        a, b, w = self.pairs(offset=offset)
+        result = align_closed_form(a, b, weights=w, scale="least_squares")
+        used = np.isfinite(a).all(axis=1) & np.isfinite(b).all(axis=1) & (w > 0)
+        p, q, v = a[used] - offset, b[used] + offset, w[used]
+        mean_p, mean_q = v @ p / v.sum(), v @ q / v.sum()
+        U, D, Vt = np.linalg.svd(((q - mean_q) * v[:, None]).T @ (p - mean_p))
+        R = U @ Vt
+        s = D.sum() / (v @ ((p - mean_p) ** 2).sum(axis=1))
+        residuals = q - mean_q - s * (p - mean_p) @ R.T
+        assert np.linalg.det(R) > 0
+        assert result.status is Status.CONVERGED
+        precision = 1e-12 if offset == 0 else 1e-9
+        np.testing.assert_allclose(result.T_target_source[:3, :3], R, atol=precision)
+        assert result.scale == pytest.approx(s, abs=precision)
+        assert result.rmse_m == pytest.approx(np.sqrt(v @ (residuals**2).sum(axis=1) / v.sum()), rel=1e-9)
+        assert result.num_inliers == used.sum()
+        assert result.note == "1540 pairs were not finite and were dropped"
+
+    def test_the_same_bytes_at_any_number_of_threads(self):
+        a, b, w = self.pairs()
+        results = []
+        for count in (1, 2, 8):
+            with limited_threads(count):
+                results.append(align_closed_form(a, b, weights=w, scale="symmetric"))
+        for other in results[1:]:
+            for name in ("T_target_source", "information", "covariance"):
+                assert getattr(results[0], name).tobytes() == getattr(other, name).tobytes()
+            assert (results[0].scale, results[0].rmse_m) == (other.scale, other.rmse_m)
+
+    def test_an_outlier_in_the_first_row_costs_no_digits(self):
+        """The first point is the origin of the first block: from 1e8 away, moments about it would lose all digits."""
+        a = np.random.default_rng(0).normal(size=(1000, 3))
+        a[0] = 1e8
+        T = random_motion(np.random.default_rng(1), 3)
+        w = np.ones(1000)
+        w[0] = 1e-30
+        result = align_closed_form(a, se3.transform_points(T, a), weights=w)
+        np.testing.assert_allclose(result.T_target_source, T, atol=1e-12)
+
+
+class TestFitPairs:
+    def test_rows_name_the_pairs(self):
+        rng = np.random.default_rng(0)
+        a, b = rng.normal(size=(50, 3)), rng.normal(size=(40, 3))
+        i, j, w = rng.integers(0, 50, 30), rng.integers(0, 40, 30), rng.uniform(0, 1, 30)
+        fit = fit_pairs(a, b, source_rows=i, target_rows=j, weights=w, scale="symmetric")
+        horn = fit_horn(a[i], b[j], w, scale="symmetric")
+        np.testing.assert_array_equal(fit.T, horn.transform)
+        assert fit.scale == horn.scale
+        assert fit.rank == horn.rank == 3
+        assert fit.error == pytest.approx(horn.error)
+        assert (fit.num_pairs, fit.num_free, fit.scale_found) == (30, 0, True)
+        assert fit.total_weight == pytest.approx(w.sum())
+        np.testing.assert_array_equal(fit.mean_target, horn.mean_target)
+
+    def test_no_pairs(self):
+        none = np.zeros(0, np.int64)
+        for fit in (
+            fit_pairs(np.eye(3), np.eye(3), source_rows=none, target_rows=none),
+            fit_pairs(np.eye(3), np.eye(3), weights=np.zeros(3)),
+            fit_pairs(np.zeros((0, 3)), np.zeros((0, 3))),
+        ):
+            assert (fit.num_pairs, fit.rank, fit.scale) == (0, 0, 1)
+            np.testing.assert_array_equal(fit.T, np.eye(4))
+
+    def test_w_zero_leaves_all_planes_free(self):
+        fit = fit_pairs(A, np.tile(B_NOISY[0], (5, 1)), scale="symmetric")
+        np.testing.assert_array_equal(fit.rotation, np.eye(2))
+        assert (fit.num_free, fit.rank, fit.scale_found, fit.scale) == (1, 0, False, 1)
+
+
+class TestPairResiduals:
+    def test_by_hand(self):
+        """R = I, t = (1, 0), s = 2: (1, 2) goes to (3, 4), which is (-1, 1) from (4, 3)."""
+        T = np.array([[1, 0, 1], [0, 1, 0], [0, 0, 1.0]])
+        result = RegistrationResult(T_target_source=T, status=Status.CONVERGED, information=np.eye(3), scale=2.0)
+        np.testing.assert_allclose(pair_residuals(result, [(1, 2)], [(4, 3)]), [(-1, 1)])
+
+    def test_they_make_up_the_rmse(self):
+        w = np.array([1, 2, 3, 4, 5.0])
+        result = align_closed_form(A, B_NOISY, weights=w, scale="least_squares")
+        residuals = pair_residuals(result, A, B_NOISY)
+        assert result.rmse_m == pytest.approx(np.sqrt(w @ (residuals**2).sum(axis=1) / w.sum()))
+        np.testing.assert_allclose(w @ residuals, 0, atol=1e-12)
+
+    def test_rows_without_a_partner_have_no_residual(self):
+        result = align_closed_form(A, B_EXACT)
+        residuals = pair_residuals(result, [(0, 0), (np.nan, 1), (np.inf, 0)], [(2, 3), (0, 0), (np.inf, 0)])
+        np.testing.assert_allclose(residuals[0], 0, atol=1e-12)
+        assert not np.isfinite(residuals[1:]).all(axis=1).any()
+
+    def test_wrong_shapes_raise(self):
+        result = align_closed_form(A, B_NOISY)
+        with pytest.raises(InvalidInputError, match="equal lengths"):
+            pair_residuals(result, A, B_NOISY[:3])
+        with pytest.raises(InvalidInputError, match="source"):
+            pair_residuals(result, np.ones((5, 3)), B_NOISY)
+
+
+def test_any_layout_and_number_type_gives_the_same_bytes():
+    rng = np.random.default_rng(0)
+    a, b = rng.integers(-9, 9, (2, 30, 3))
+    expected = align_closed_form(a.astype(float), b.astype(float)).T_target_source.tobytes()
+    frozen = a.astype(float)
+    frozen.flags.writeable = False
+    for one in (a, a.astype(np.float32), np.asfortranarray(a), a.tolist(), frozen, np.repeat(a, 2, axis=0)[::2]):
+        assert align_closed_form(one, b).T_target_source.tobytes() == expected
+
+
+def test_weights_that_are_no_numbers_raise():
+    with pytest.raises(InvalidInputError, match="weights"):
+        align_closed_form(A, B_NOISY, weights=["a", "b", "c", "d", "e"])
 
 
 def test_integers_are_points_and_arguments_stay_as_they_are():

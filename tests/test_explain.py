@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from scanweld.errors import InvalidInputError, OutputError
+from scanweld.geometry import se3
 from scanweld.geometry.point_cloud import PointCloud
 from scanweld.registration.closed_form import align_closed_form
 from scanweld.registration.explain import WORKED_SOURCE, WORKED_TARGET, explain_horn, explain_icp
@@ -78,6 +79,7 @@ def test_a_good_run_in_space_is_called_good():
     explanation = explain_icp(source, source + [0.05, 0, 0.02])
     assert explanation.verdict.startswith("Verdict: converged")
     assert "What would help" not in explanation.verdict
+    assert "wrong local minimum" not in explanation.verdict
     text = explanation.text()
     assert max(map(len, text.splitlines())) <= 84  # three columns of W beside four of coordinates
     assert "0.0500" in text
@@ -103,9 +105,117 @@ def test_what_cannot_be_explained(source, target, words):
         explain_icp(source, target)
 
 
-def test_other_methods_cannot_be_explained():
-    with pytest.raises(InvalidInputError, match="point-to-point"):
-        explain_icp(config=IcpConfig(method="point-to-plane"))
+def corner(count):
+    """Points on three faces that meet, and their normals (N, 3)."""
+    points, normals = np.random.default_rng(1).uniform(0, 2, (count, 3)), np.zeros((count, 3))
+    for k in range(3):
+        points[k::3, k], normals[k::3, k] = 0, 1
+    return points, normals
+
+
+class TestGaussNewton:
+    """The tables of point-to-plane and its relatives."""
+
+    def test_one_step_by_hand(self):
+        """Two points on the line y = 0 (normals (0, 1)) and one on x = 0 (normal (1, 0)); every p' is 0.1 too far along
+        its normal.
+
+        Target (-1, 0), (1, 0), (0, 1.5): centre (0, 0.5). About it the moved points are (-1, -0.4),
+        (1, -0.4) and (0.1, 1).
+        J = n^T [I | (-y, x)]: (0, 1, -1), (0, 1, 1), (1, 0, -1), r = 0.1 each, so
+
+            H = [[1, 0, -1], [0, 2, 0], [-1, 0, 3]],  g = (0.1, 0.2, -0.1).
+
+        H xi = -g gives the shift (-0.1, -0.1) and no turn.
+        """
+        target, normals = np.array([(-1.0, 0), (1, 0), (0, 1.5)]), np.array([(0.0, 1), (0, 1), (1, 0)])
+        cloud = PointCloud(target, normals)
+        config = IcpConfig(kernel="none", max_correspondence_distance_m=1, min_overlap=0)
+        step = explain_icp(target + 0.1 * normals, cloud, config=config).steps[0]
+        np.testing.assert_allclose(step.center_m, [0, 0.5], atol=1e-15)
+        np.testing.assert_allclose(step.moved, [(-1, -0.4), (1, -0.4), (0.1, 1)], atol=1e-15)
+        np.testing.assert_allclose(step.residuals_m, 0.1, atol=1e-15)
+        np.testing.assert_allclose(step.weights, 1)
+        np.testing.assert_allclose(step.information, [[1, 0, -1], [0, 2, 0], [-1, 0, 3]], atol=1e-15)
+        np.testing.assert_allclose(step.gradient, [0.1, 0.2, -0.1], atol=1e-15)
+        np.testing.assert_allclose(step.xi, [-0.1, -0.1, 0], atol=1e-15)
+        np.testing.assert_allclose(step.T_total, [[1, 0, -0.1], [0, 1, -0.1], [0, 0, 1]], atol=1e-15)
+
+    @pytest.mark.parametrize("dimension", [2, 3])
+    @pytest.mark.parametrize("method", ["point-to-plane", "gicp"])
+    def test_the_steps_shown_are_those_taken(self, method, dimension):
+        """exp(xi) T_before, about the target's centre, is the T_after that the run recorded, step for step."""
+        if dimension == 3:
+            target = corner(120)[0]
+            motion = se3.exp([0.05, -0.04, 0.03, 0.02, 0.01, -0.03])
+        else:
+            along = np.linspace(0, 1, 40)
+            target = np.concatenate([np.column_stack([along, 0 * along]), np.column_stack([0 * along, along])])
+            motion = np.array([[np.cos(0.03), -np.sin(0.03), 0.01], [np.sin(0.03), np.cos(0.03), -0.02], [0, 0, 1]])
+        explanation = explain_icp(se3.transform_points(motion, target), target, config=IcpConfig(method=method))
+        before = np.eye(dimension + 1)
+        assert len(explanation.steps) > 1
+        for step in explanation.steps:
+            to_center = np.eye(dimension + 1)
+            to_center[:-1, -1] = -step.center_m
+            xi = step.xi if dimension == 3 else np.array([*step.xi[:2], 0, 0, 0, step.xi[2]])
+            T_step = se3.exp(xi)
+            if dimension == 2:
+                T_step = T_step[np.ix_([0, 1, 3], [0, 1, 3])]
+            taken = se3.inverse(to_center) @ T_step @ to_center @ before
+            np.testing.assert_allclose(step.T_total, taken, atol=1e-9)
+            before = step.T_total
+        np.testing.assert_allclose(before, explanation.result.T_target_source, atol=1e-12)
+        text = explanation.text()
+        assert max(map(len, text.splitlines())) <= 80
+        assert text.count("    H = sum w J^T J") == len(explanation.steps)
+
+    def test_coloured_needs_colours_and_shows_them(self):
+        target, normals = corner(90)
+        colors = (100 + 60 * np.sin(3 * target)).astype(np.uint8)
+        source = PointCloud(target + 0.02, normals, colors)
+        explanation = explain_icp(source, PointCloud(target, normals, colors), config=IcpConfig(method="coloured"))
+        assert "a row of intensity" in explanation.text()
+        assert explanation.result.status.success
+
+    def test_free_directions_are_named_and_get_no_step(self):
+        """A line of points slides along itself."""
+        target = np.column_stack([np.linspace(0, 1, 50), np.zeros(50)])
+        explanation = explain_icp(target + [0, 0.01], target, config=IcpConfig())
+        first = explanation.steps[0]
+        assert first.free == ("translation along (1.00, 0.00)",)
+        assert abs(first.xi[0]) < 1e-12
+        assert "free, no step along it: translation along (1.00, 0.00)" in explanation.text()
+
+    @pytest.mark.parametrize(
+        "config",
+        [
+            IcpConfig(anderson=5),
+            IcpConfig(graduated=True),
+            IcpConfig(scale="least_squares"),
+            IcpConfig(voxel_m=0.1),
+            IcpConfig(method="point-to-point", kernel="huber"),
+        ],
+    )
+    def test_settings_that_the_tables_do_not_show(self, config):
+        with pytest.raises(InvalidInputError, match="cannot be explained step by step"):
+            explain_icp(config=config)
+
+
+def test_a_scale_is_explained_where_it_is_estimated():
+    """T_1 .. T_k with their scales compose to the result: x_target = s R x_source + t."""
+    source = np.random.default_rng(0).normal(size=(30, 2))
+    explanation = explain_icp(
+        source, 1.03 * source + 0.02, config=IcpConfig(method="point-to-point", scale="symmetric")
+    )
+    T, scale = np.eye(3), 1.0
+    for step in explanation.steps:
+        fit = step.horn.fit
+        T = T @ np.block([[step.T_step[:2, :2], scale * step.T_step[:2, 2:]], [np.zeros((1, 2)), np.ones((1, 1))]])
+        scale *= fit.scale
+        np.testing.assert_allclose(T, step.T_total, atol=1e-9)
+    assert scale == pytest.approx(1.03, abs=1e-9)
+    assert "scaled by 1.0300" in explanation.verdict
 
 
 def test_the_verdict_says_that_free_directions_were_put_back():
@@ -150,9 +260,28 @@ class TestPictures:
         for name in ("horn", "icp", "both"):
             image = self.pixels(tmp_path / f"{name}.png")
             assert image.shape[0] > 200 < image.shape[1]
-            for color in ((209, 73, 91), (0, 121, 140)):
+            for color in ((213, 94, 0), (0, 114, 178)):
                 assert (np.abs(image - color).max(axis=2) < 60).sum() > 50
         assert sorted(p.name for p in tmp_path.iterdir()) == ["both.png", "horn.png", "icp.png"]
+
+    def test_large_clouds_get_a_slice(self, tmp_path):
+        """Two rows instead of one, so the picture is about twice as high; before and after share their axes."""
+        target = np.random.default_rng(0).uniform(0, 2, (3000, 3)) * [1, 1, 0.5]
+        result = align_closed_form(target, target)
+        draw_alignment(tmp_path / "large.png", PointCloud(target), PointCloud(target + 0.3), result)
+        draw_alignment(tmp_path / "small.png", PointCloud(target[:900]), PointCloud(target[:900] + 0.3), result)
+        large, small = (self.pixels(tmp_path / f"{name}.png").shape for name in ("large", "small"))
+        assert 1.6 < large[0] / small[0] < 2.1
+        assert large[1] == pytest.approx(small[1], rel=0.05)
+
+    @pytest.mark.parametrize(
+        "points", [np.zeros((0, 3)), np.zeros((1, 2)), np.zeros((3000, 3)), np.full((5, 3), np.nan)]
+    )
+    def test_odd_clouds_are_drawn_too(self, tmp_path, points):
+        cloud = PointCloud(points)
+        result = align_closed_form(points, points)
+        draw_alignment(tmp_path / "odd.png", cloud, cloud, result)
+        assert (tmp_path / "odd.png").stat().st_size > 5000
 
     @pytest.mark.parametrize(("name", "start"), [("a.pdf", b"%PDF"), ("a.SVG", b"<?xml"), ("a.png", b"\x89PNG")])
     def test_the_ending_chooses_the_format(self, tmp_path, name, start):

@@ -18,6 +18,9 @@ Int32: TypeAlias = npt.NDArray[np.int32]
 Int64: TypeAlias = npt.NDArray[np.int64]
 Bool: TypeAlias = npt.NDArray[np.bool_]
 
+LARGEST_COORDINATE = 1e100
+"""Squares of larger ones overflow; no unit of length makes them."""
+
 ROTATION_TOLERANCE = 1e-4
 """Largest entry of R^T R - I that is still a rotation (files print four to nine digits)."""
 
@@ -50,6 +53,8 @@ def as_points(points: npt.ArrayLike, name: str = "points", *, dimensions: tuple[
         converted = np.ascontiguousarray(array, dtype=np.float64)
     if isinstance(points, np.ma.MaskedArray) and np.ma.is_masked(points):
         converted = np.where(np.ma.getmaskarray(points), np.nan, converted)
+    if converted.size and LARGEST_COORDINATE < max(float(converted.max()), -float(converted.min())) < np.inf:
+        raise InvalidInputError(f"{name}: a coordinate is beyond {LARGEST_COORDINATE:g}; is a column no coordinate?")
     return converted
 
 

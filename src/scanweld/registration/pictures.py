@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from scanweld.arrays import Float64, Int64
 from scanweld.errors import OutputError
@@ -19,10 +20,22 @@ from scanweld.geometry import se3
 from scanweld.geometry.point_cloud import PointCloud
 from scanweld.io.atomic import write_file
 from scanweld.registration.explain import HornExplanation, IcpExplanation
-from scanweld.registration.result import RegistrationResult
+from scanweld.registration.result import RegistrationResult, Status
 
-_SOURCE, _TARGET, _PAIR, _INK = "#d1495b", "#00798c", "#9aa5b1", "#22303c"
-_MOST_DRAWN = 30_000
+# Vermilion and blue of Okabe and Ito, which people with any kind of colour blindness tell apart.
+_SOURCE, _TARGET, _PAIR, _INK = "#d55e00", "#0072b2", "#9aa5b1", "#22303c"
+_MOST_DRAWN = 30_000  # points of a cloud, in all panels of a row
+_SLICED_FROM = 2000  # points; fewer are seen one by one
+_SLICE = 0.03  # of the extent along the view: thin enough to show walls as lines
+
+VERDICTS = {
+    Status.CONVERGED: "converged",
+    Status.MAX_ITERATIONS: "not converged within the allowed steps",
+    Status.TOO_FEW_CORRESPONDENCES: "no answer: too few correspondences",
+    Status.DEGENERATE: "degenerate: the data does not determine the whole motion",
+    Status.NO_OVERLAP: "no answer: the sets do not overlap",
+}
+"""What a status means, in words."""
 
 FORMATS = (".png", ".pdf", ".svg")
 """Endings of the pictures that can be written."""
@@ -31,7 +44,9 @@ FORMATS = (".png", ".pdf", ".svg")
 def draw_alignment(
     path: str | os.PathLike[str], source: PointCloud, target: PointCloud, result: RegistrationResult
 ) -> None:
-    """Draw source and target before and after the alignment, seen along their thinnest direction.
+    """Draw source and target before and after the alignment, seen along the axis in which the target varies least.
+
+    Large clouds in space get a second row: a thin slice, in which surfaces are lines and errors show.
 
     Raises
     ------
@@ -40,18 +55,39 @@ def draw_alignment(
     """
     moved = source.transformed(result.T_target_source, result.scale)
     view = _View(target.points_m)
-    clouds = [view.flatten(_thinned(cloud.finite().points_m)) for cloud in (target, source, moved)]
-    titles = ("before", f"after: {result.status.value.replace('_', ' ')}, rmse {result.rmse_m:.3g} m")
-    figure, axes = _panels(titles, *_limits(np.concatenate(clouds)))
-    for axis, cloud in zip(axes, clouds[1:], strict=True):
-        points = np.concatenate([clouds[0], cloud])
-        colors = np.repeat([_TARGET, _SOURCE], [len(clouds[0]), len(cloud)])
-        mixed = np.random.default_rng(0).permutation(len(points))  # neither cloud hides the other
-        size = float(np.clip(40_000 / max(len(points), 1), 0.6, 36))
-        axis.scatter(*points[mixed].T, s=size, c=colors[mixed], alpha=0.8, linewidths=0, rasterized=True)
-        for label, color in (("target", _TARGET), ("source", _SOURCE)):
-            axis.scatter([], [], c=color, label=label)
+    clouds = [cloud.finite().points_m for cloud in (target, source, moved)]
+    rows, notes = [clouds], [view.words]
+    if view.axis is not None and max(map(len, clouds)) > _SLICED_FROM:
+        slab = view.slab(clouds[0], clouds[2])
+        rows.append([cloud[view.within(cloud, slab)] for cloud in clouds])
+        notes.append(view.slab_words(slab))
+    # Before and after share their axes, so both must fit: all of the target and the source at either place.
+    low, high = _limits(np.concatenate([view.flatten(_thinned(cloud, _MOST_DRAWN)) for cloud in clouds]))
+    titles = [f"{moment}, {note}" for note in notes for moment in ("before", "after")]
+    figure, axes = _panels(titles, low, high, columns=2)
+    for row, (still, *places) in enumerate(rows):
+        for axis, cloud in zip(axes[2 * row :], places, strict=False):
+            _scatter(axis, view.flatten(_thinned(still, _MOST_DRAWN)), view.flatten(_thinned(cloud, _MOST_DRAWN)))
+    figure.suptitle(_headline(result), x=0.01, ha="left", fontsize=12, color=_INK)
     _finish(path, figure, axes, view)
+
+
+def _headline(result: RegistrationResult) -> str:
+    scale = f", scale {result.scale:.4g}" if result.scale != 1 else ""
+    figures = f"rmse {result.rmse_m:.3g} m, overlap {result.overlap:.0%}{scale}"
+    return f"{VERDICTS[result.status].capitalize()} ({figures})"
+
+
+def _scatter(axis: Any, target: Float64, source: Float64) -> None:
+    """Draw two clouds so that neither hides the other."""
+    points = np.concatenate([target, source])
+    colors = np.repeat([_TARGET, _SOURCE], [len(target), len(source)])
+    mixed = np.random.default_rng(0).permutation(len(points))
+    size = float(np.clip(20_000 / max(len(points), 1), 0.4, 36))
+    alpha = 0.8 if size > 2 else 0.55
+    axis.scatter(*points[mixed].T, s=size, c=colors[mixed], alpha=alpha, linewidths=0, rasterized=True)
+    for label, color in (("target", _TARGET), ("source", _SOURCE)):
+        axis.scatter([], [], c=color, label=label)
 
 
 def draw_horn(path: str | os.PathLike[str], explanation: HornExplanation) -> None:
@@ -88,47 +124,82 @@ def draw_icp(path: str | os.PathLike[str], explanation: IcpExplanation, most: in
 
 
 class _View:
-    """Looks at points along the direction in which they vary least."""
+    """Looks at points along the axis in which they vary least; an axis, so that the ticks stay readable."""
 
     def __init__(self, points: Float64) -> None:
         finite = points[np.isfinite(points).all(axis=1)]
-        self.center = finite.mean(axis=0) if len(finite) else np.zeros(points.shape[1])
-        self.plane = np.eye(points.shape[1])[:2]
-        self.labels = ("x [m]", "y [m]")
-        if points.shape[1] == 3 and len(finite) > 2:
-            spread = np.abs(np.linalg.eigh(np.cov(finite.T))[1][:, 0])
-            keep = [k for k in range(3) if k != int(spread.argmax())]  # along an axis: the ticks stay readable
-            self.plane = np.eye(3)[keep]
-            self.labels = (f"{'xyz'[keep[0]]} [m]", f"{'xyz'[keep[1]]} [m]")
+        dimension = points.shape[1]
+        self.axis: int | None = None
+        keep = [0, 1]
+        if dimension == 3:
+            self.axis = 2
+            if len(finite) > 2:
+                self.axis = int(np.abs(np.linalg.eigh(np.cov(finite.T))[1][:, 0]).argmax())
+            keep = [k for k in range(3) if k != self.axis]
+        self.keep = keep
+        self.labels = (f"{'xyz'[keep[0]]} [m]", f"{'xyz'[keep[1]]} [m]")
+
+    @property
+    def words(self) -> str:
+        """What is seen."""
+        return "all points" if self.axis is None else f"all points, seen along {'xyz'[self.axis]}"
 
     def flatten(self, points: Float64) -> Float64:
-        return points @ self.plane.T
+        """Points as they are seen, (N, 2)."""
+        return points[:, self.keep]
+
+    def slab(self, target: Float64, moved: Float64) -> tuple[float, float]:
+        """Bounds along the axis of the slice in which both clouds show most, floors and ceilings aside."""
+        low, high = np.percentile(target[:, self.axis], [2, 98])
+        left, right = np.percentile(self.flatten(target), [2, 98], axis=0)
+        thickness = max(_SLICE * float((right - left).max()), 1e-12)
+        starts = np.linspace(low, max(high - thickness, low), 16)
+        both = np.array([self._shown(target, moved, (at, at + thickness), thickness) for at in starts])
+        # A horizontal surface fills its slice and hides how the walls fit.
+        surface = both > 2 * np.median(both[both > 0]) if (both > 0).any() else np.zeros(len(both), np.bool_)
+        best = float(starts[np.where(surface, 0, both).argmax()])
+        return best, best + thickness
+
+    def within(self, points: Float64, slab: tuple[float, float]) -> npt.NDArray[np.bool_]:
+        """Mask of the points within bounds along the axis."""
+        heights = points[:, self.axis]
+        return np.asarray((heights >= slab[0]) & (heights < slab[1]))
+
+    def slab_words(self, slab: tuple[float, float]) -> str:
+        """Where the slice is."""
+        assert self.axis is not None
+        return f"slice of {slab[1] - slab[0]:.2g} m at {'xyz'[self.axis]} = {sum(slab) / 2:.3g} m"
+
+    def _shown(self, target: Float64, moved: Float64, slab: tuple[float, float], size: float) -> int:
+        """Area that the slice shows of the cloud of which it shows less, in squares."""
+        flat = (self.flatten(cloud[self.within(cloud, slab)]) for cloud in (target, moved))
+        return min(len(np.unique(np.floor(points / size), axis=0)) for points in flat)
 
 
-def _thinned(points: Float64) -> Float64:
-    return points[:: max(1, len(points) // _MOST_DRAWN)]
+def _thinned(points: Float64, most: int) -> Float64:
+    return points[:: max(1, -(-len(points) // most))]
 
 
 def _limits(points: Float64) -> tuple[Float64, Float64]:
     """Corners of what is worth seeing: a few stray points do not shrink the rest."""
     if len(points) == 0:
         return np.zeros(2), np.ones(2)
-    share = 0.5 if len(points) > 1000 else 0.0
+    share = 1.0 if len(points) > 1000 else 0.0
     low, high = np.percentile(points, [share, 100 - share], axis=0)
     margin = 0.12 * max(float((high - low).max()), 1e-12)
     return low - margin, high + margin
 
 
-def _panels(titles: Sequence[str], low: Float64, high: Float64) -> tuple[Any, list[Any]]:
+def _panels(titles: Sequence[str], low: Float64, high: Float64, columns: int = 0) -> tuple[Any, list[Any]]:
     """Lay out one panel for each title, shaped like the view from corner `low` to corner `high`."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     count = len(titles)
-    columns = min(count, 4) if count != 5 else 3
+    columns = columns or (3 if count == 5 else min(count, 4))
     rows = -(-count // columns)
-    width, height = 3.9 * (high - low) / max(high - low)
-    size = (max(width, 2.4) * columns + 0.7, max(height, 1.6) * rows + 0.6 * rows + 0.2)
+    width, height = (4.8 if columns == 2 else 3.9) * (high - low) / max(high - low)
+    size = (max(width, 3.2) * columns + 0.7, max(height, 1.6) * rows + 0.6 * rows + 0.4)
     figure = Figure(figsize=size, dpi=130, layout="constrained")
     FigureCanvasAgg(figure)
     axes = list(figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True).flat)

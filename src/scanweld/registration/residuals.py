@@ -92,3 +92,48 @@ def point_equations(moved: Float64, target: Float64, weights: Float64) -> Normal
         centroid_m=centroid,
         radius_m=float(np.sqrt(share @ ((moved - centroid) ** 2).sum(axis=1))),
     )
+
+
+def symmetric(moved: Float64, target: Float64, normals: Float64, source_normals: Float64) -> tuple[Float64, Float64]:
+    """Return the residuals (n + m) / 2 . (p' - q) (N,) and their Jacobians (N, K), both sides turned by half.
+
+    Rusinkiewicz 2019, eq. 9: the rotation's arm is the middle of the pair. Normals have no sign: m is turned to n.
+
+    Parameters
+    ----------
+    source_normals : (N, D), moved with the points
+    """
+    sign = np.where(np.einsum("nd,nd->n", normals, source_normals) >= 0, 1.0, -1.0)
+    middle = (normals + sign[:, None] * source_normals) / 2
+    residuals = np.einsum("nd,nd->n", middle, moved - target)
+    arms = (moved + target) / 2
+    turns = np.einsum("na,kab,nb->nk", middle, rotation_generators(moved.shape[1]), arms)
+    return residuals, np.concatenate([middle, turns], axis=1)
+
+
+def generalised_information(normals: Float64, source_normals: Float64, thickness: float) -> Float64:
+    """Return 2 thickness (C_q + C_p)^-1 (N, D, D) with discs C = I - (1 - thickness) n n^T (Segal et al. 2009, eq. 2).
+
+    The factor makes a residual along two equal normals count 1, as in point-to-plane.
+    """
+    flat = 1 - thickness
+    identity = np.eye(normals.shape[1])
+    discs = [identity - flat * n[:, :, None] * n[:, None, :] for n in (normals, source_normals)]
+    return np.asarray(2 * thickness * np.linalg.inv(discs[0] + discs[1]))
+
+
+def coloured(
+    moved: Float64, target: Float64, normals: Float64, gradients: Float64, difference: Float64
+) -> tuple[Float64, Float64]:
+    """Return the residuals of intensity (N,) and their Jacobians (N, K) (Park et al. 2017, eq. 12 to 15).
+
+    Parameters
+    ----------
+    gradients : (N, 3), of the target's intensity in its tangent planes [1/m]
+    difference : (N,), the target's minus the source's intensity, at the points
+    """
+    along = np.einsum("nd,nd->n", gradients, normals)
+    tangent = gradients - along[:, None] * normals
+    residuals = difference + np.einsum("nd,nd->n", gradients, moved - target)
+    turns = np.einsum("na,kab,nb->nk", tangent, rotation_generators(3), moved)
+    return residuals, np.concatenate([tangent, turns], axis=1)

@@ -59,6 +59,7 @@ class RegistrationResult:
     T_target_source : (D + 1, D + 1), maps source points to the target frame: x_target = scale R x + t
     status : see :class:`Status`
     scale : 1 unless scale was estimated; never hidden in the matrix
+    scale_std : standard deviation of the scale; 0 where it is not estimated
     num_iterations : iterations done
     num_inliers : correspondences that the last step used
     overlap : share of the source points with an accepted correspondence, 0..1
@@ -67,6 +68,9 @@ class RegistrationResult:
         aligner has a noise model, else 0)
     information : (6, 6) in 3-D, (3, 3) in 2-D; Gauss-Newton Hessian of the metric that was minimised, translation [m]
         first, rotation [rad] second, left perturbation at the target's origin
+    covariance : of the estimate, in the order, perturbation and origin of `information`, from the scatter of the residuals;
+        free directions have no finite variance: they are zero here and named in `unobservable`. None where the aligner
+        makes no claim
     unobservable : directions that the data leaves free; they stay at the initial guess
     note : one sentence for a person: why the status is not CONVERGED, and what was dropped; "" where nothing is amiss
     history : the steps, where asked for
@@ -76,11 +80,13 @@ class RegistrationResult:
     status: Status
     information: Float64
     scale: float = 1.0
+    scale_std: float = 0.0
     num_iterations: int = 0
     num_inliers: int = 0
     overlap: float = 0.0
     rmse_m: float = 0.0
     loss: float = 0.0
+    covariance: Float64 | None = None
     unobservable: tuple[FreeDirection, ...] = ()
     note: str = ""
     history: tuple[Any, ...] = ()
