@@ -35,12 +35,13 @@ if TYPE_CHECKING:
     from scanweld.geometry import se3
     from scanweld.geometry.camera import PinholeCamera
     from scanweld.geometry.depth import SurfaceConfig, SurfacePyramid, build_pyramid
+    from scanweld.geometry.foreign import as_cloud
     from scanweld.geometry.frame import Frame
     from scanweld.geometry.normals import estimate_normals
     from scanweld.geometry.point_cloud import PointCloud, voxel_downsample
     from scanweld.geometry.views import MapCorrection, ModelView
     from scanweld.io.ply import read_ply, write_ply
-    from scanweld.io.point_files import read_points
+    from scanweld.io.point_files import read_points, write_points
     from scanweld.io.trajectory_files import read_trajectory, write_tum
     from scanweld.loop_closure.loop_closer import NoLoopCloser
     from scanweld.mapping.fusion import FusionConfig
@@ -48,11 +49,22 @@ if TYPE_CHECKING:
     from scanweld.mapping.rendering import render_picture
     from scanweld.mapping.surfel_map import SurfelMap
     from scanweld.parallel import set_num_threads
-    from scanweld.registration.closed_form import align_closed_form
+    from scanweld.registration.closed_form import (
+        ClosedFormBatch,
+        align_closed_form,
+        align_closed_form_batch,
+        pair_residuals,
+    )
     from scanweld.registration.explain import explain_horn, explain_icp
+    from scanweld.registration.global_registration import GlobalConfig, register_global
     from scanweld.registration.icp import IcpConfig, icp
+    from scanweld.registration.many import ManyConfig, ManyResult, ScanPair, register_many
+    from scanweld.registration.pose_graph import PoseGraph, PoseGraphConfig, PoseGraphResult, edge_information
+    from scanweld.registration.prior import MotionPrior
     from scanweld.registration.projective import ProjectiveConfig
     from scanweld.registration.result import RegistrationResult, Status
+    from scanweld.registration.robust_pairs import RobustAlignment, align_pairs_robustly
+    from scanweld.registration.uncertainty import point_covariances
     from scanweld.runs.run import RunSummary, run_sequence
     from scanweld.slam.system import Slam, SlamConfig, build_slam
     from scanweld.tracking.tracker import FrameToModelTracker, TrackingConfig
@@ -76,12 +88,13 @@ _HOME = {
     "geometry": ("se3",),
     "geometry.camera": ("PinholeCamera",),
     "geometry.depth": ("SurfaceConfig", "SurfacePyramid", "build_pyramid"),
+    "geometry.foreign": ("as_cloud",),
     "geometry.frame": ("Frame",),
     "geometry.normals": ("estimate_normals",),
     "geometry.point_cloud": ("PointCloud", "voxel_downsample"),
     "geometry.views": ("MapCorrection", "ModelView"),
     "io.ply": ("read_ply", "write_ply"),
-    "io.point_files": ("read_points",),
+    "io.point_files": ("read_points", "write_points"),
     "io.trajectory_files": ("read_trajectory", "write_tum"),
     "loop_closure.loop_closer": ("NoLoopCloser",),
     "mapping.fusion": ("FusionConfig",),
@@ -89,11 +102,19 @@ _HOME = {
     "mapping.rendering": ("render_picture",),
     "mapping.surfel_map": ("SurfelMap",),
     "parallel": ("set_num_threads",),
-    "registration.closed_form": ("align_closed_form",),
+    "registration.closed_form": (
+        "ClosedFormBatch", "align_closed_form", "align_closed_form_batch", "pair_residuals",
+    ),
     "registration.explain": ("explain_horn", "explain_icp"),
     "registration.icp": ("IcpConfig", "icp"),
+    "registration.prior": ("MotionPrior",),
     "registration.projective": ("ProjectiveConfig",),
     "registration.result": ("RegistrationResult", "Status"),
+    "registration.global_registration": ("GlobalConfig", "register_global"),
+    "registration.many": ("ManyConfig", "ManyResult", "ScanPair", "register_many"),
+    "registration.pose_graph": ("PoseGraph", "PoseGraphConfig", "PoseGraphResult", "edge_information"),
+    "registration.robust_pairs": ("RobustAlignment", "align_pairs_robustly"),
+    "registration.uncertainty": ("point_covariances",),
     "runs.run": ("RunSummary", "run_sequence"),
     "slam.system": ("Slam", "SlamConfig", "build_slam"),
     "tracking.tracker": ("FrameToModelTracker", "TrackingConfig"),
@@ -103,6 +124,7 @@ _HOME = {
 _MODULE_OF = {name: module for module, names in _HOME.items() for name in names}
 
 __all__ = [
+    "ClosedFormBatch",
     "ConfigError",
     "DatasetError",
     "FileFormatError",
@@ -111,20 +133,29 @@ __all__ = [
     "FrameState",
     "FrameToModelTracker",
     "FusionConfig",
+    "GlobalConfig",
     "IcpConfig",
     "InvalidInputError",
+    "ManyConfig",
+    "ManyResult",
     "MapCorrection",
     "MissingDependencyError",
     "ModelView",
+    "MotionPrior",
     "NoLoopCloser",
     "OutputError",
     "PinholeCamera",
     "PointCloud",
+    "PoseGraph",
+    "PoseGraphConfig",
+    "PoseGraphResult",
     "ProjectiveConfig",
     "RegistrationResult",
     "RenderConfig",
     "RgbdSequence",
+    "RobustAlignment",
     "RunSummary",
+    "ScanPair",
     "ScanweldError",
     "Slam",
     "SlamConfig",
@@ -139,21 +170,29 @@ __all__ = [
     "TwoFrameConfig",
     "UnreadableFrameError",
     "align_closed_form",
+    "align_closed_form_batch",
     "align_frames",
+    "align_pairs_robustly",
+    "as_cloud",
     "ate",
     "build_pyramid",
     "build_slam",
     "compression_ratio",
     "depth_completeness",
+    "edge_information",
     "estimate_normals",
     "explain_horn",
     "explain_icp",
     "from_mapping",
     "icp",
     "open_sequence",
+    "pair_residuals",
+    "point_covariances",
     "read_ply",
     "read_points",
     "read_trajectory",
+    "register_global",
+    "register_many",
     "render_picture",
     "render_sequence",
     "rpe",
@@ -166,6 +205,7 @@ __all__ = [
     "to_toml",
     "voxel_downsample",
     "write_ply",
+    "write_points",
     "write_tum",
 ]
 
