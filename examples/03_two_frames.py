@@ -1,7 +1,8 @@
 """Two frames before and after: find the motion between two views, and know whether to believe it.
 
-Two frames of a rendered room, recorded with the noise of a Kinect, are aligned without a first guess. Then the same is
-tried with a frame that shows another side of the room: there is no answer, and the status says so.
+Two frames of a rendered room, recorded with the noise of a Kinect, are aligned without a first guess: a near pair, and
+one that is more than two metres and 68 degrees apart, where image features find the start. Then the same is tried with
+a frame of another place: there is no answer, and the status says so.
 """
 
 import argparse
@@ -14,21 +15,26 @@ import scanweld as sw
 
 
 def main(out: Path, small: bool) -> None:
-    """Align a pair of frames with and one without overlap, print the figures, draw the first pair."""
+    """Align a near and a far pair of frames, and one without overlap; print the figures, draw the far pair."""
     size = {"width": 320, "height": 240} if small else {}
-    sequence = sw.SyntheticSequence(sw.RenderConfig(scene="room", noise="kinect", **size))
+    room, corridor = (
+        sw.SyntheticSequence(sw.RenderConfig(scene=scene, noise="kinect", **size)) for scene in ("room", "corridor")
+    )
     first, near, far = 75, 25, 250
-    a, b, elsewhere = (sequence.read(index) for index in (first, near, far))
+    a = room.read(first)
+    for other in (near, far):
+        b = room.read(other)
+        result = sw.align_frames(a, b)
+        T_truth = motion(room.ground_truth, first, other)
+        print(f"frames {first} and {other}: {result.status.value}, overlap {result.overlap:.0%}")
+        print(f"  error before  {describe(T_truth)}  (the motion between them)")
+        print(f"  error after   {describe(sw.se3.inverse(T_truth) @ result.T_target_source)}")
+        print(
+            f"  {result.num_inliers} points lie {result.rmse_m * 1000:.1f} mm (rms) off the surfaces of the other frame"
+        )
 
-    result = sw.align_frames(a, b)
-    T_truth = motion(sequence.ground_truth, first, near)
-    print(f"frames {first} and {near}: {result.status.value}, overlap {result.overlap:.0%}")
-    print(f"  error before  {describe(T_truth)}  (the motion between them)")
-    print(f"  error after   {describe(sw.se3.inverse(T_truth) @ result.T_target_source)}")
-    print(f"  {result.num_inliers} points lie {result.rmse_m * 1000:.1f} mm (rms) off the surfaces of the other frame")
-
-    nothing = sw.align_frames(a, elsewhere)
-    print(f"frames {first} and {far}: {nothing.status.value}: {nothing.note}")
+    nothing = sw.align_frames(a, corridor.read(0))
+    print(f"a frame of the room and one of a corridor: {nothing.status.value}: {nothing.note}")
 
     out.mkdir(parents=True, exist_ok=True)
     draw(out / "03_two_frames.png", a, b, result.T_target_source)
