@@ -16,7 +16,7 @@ OPTIONS = {
     "demo": "--out --frames --threads --json",
     "slam": "--out --format --camera --depth-scale --frames --scale --poses --config --set --threads --force --json "
     "--tracked-only",
-    "register": "--method --scale --init --voxel --max-distance --threads --explain --plot --out --json",
+    "register": "--method --scale --init --global --voxel --max-distance --set --threads --explain --plot --out --json",
     "evaluate": "--align --json --plot",
     "render": "--out --scene --path --path-frame --noise --frames --size --fps --seed --force",
 }

@@ -3,21 +3,33 @@
 from __future__ import annotations
 
 import json
+import os
 import re
+import subprocess
+import sys
+import time
+from pathlib import Path
 
 import numpy as np
 import pytest
 import typer
 
+from scanweld.cli.app import run as command_line
 from scanweld.cli.register import register
-from scanweld.errors import FileFormatError, InvalidInputError, OutputError
+from scanweld.cli.registration.alignment import Aligner, run_timed
+from scanweld.cli.registration.options import Method, settings
+from scanweld.datasets.synthetic import RenderConfig, SyntheticSequence
+from scanweld.errors import ConfigError, FileFormatError, InvalidInputError, OutputError
 from scanweld.geometry import se3
 from scanweld.geometry.point_cloud import PointCloud
 from scanweld.io.ply import read_ply, write_ply
+from scanweld.io.point_files import read_points
+from scanweld.registration.closed_form import align_closed_form
 from scanweld.registration.icp import IcpConfig, icp
+from scanweld.registration.local.config import METHODS
 
-KEYS = {"status", "T_target_source", "scale", "rmse_m", "overlap", "num_inliers", "num_iterations", "information",
-        "unobservable", "seconds"}  # fmt: skip
+KEYS = {"status", "T_target_source", "scale", "scale_std", "rmse_m", "overlap", "num_inliers", "num_iterations",
+        "information", "covariance", "unobservable", "seconds"}  # fmt: skip
 T = se3.exp([0.05, -0.03, 0.04, 0.03, -0.02, 0.04])
 
 
@@ -57,8 +69,8 @@ def test_json_is_the_only_output_and_holds_the_contract(run, clouds):
     assert set(figures) >= KEYS
     assert figures["status"] == "converged"
     np.testing.assert_allclose(figures["T_target_source"], T, atol=1e-9)
-    assert np.shape(figures["information"]) == (6, 6)
-    assert figures["scale"] == 1
+    assert np.shape(figures["information"]) == np.shape(figures["covariance"]) == (6, 6)
+    assert (figures["scale"], figures["scale_std"]) == (1, 0)
     assert figures["unobservable"] == []
     assert figures["seconds"] > 0
 
@@ -73,13 +85,158 @@ def test_the_defaults_are_those_of_the_api(run, clouds):
     assert twice["T_target_source"] == figures["T_target_source"]
 
 
-@pytest.mark.parametrize("method", ["point-to-point", "point-to-plane", "closed-form"])
+@pytest.mark.parametrize("method", [method.value for method in Method])
 def test_every_method(run, clouds, method):
+    """Clouds whose points coincide: every method finds T to the printed digits."""
+    for file in clouds:
+        points = read_ply(file).points_m
+        write_ply(file, PointCloud(points, colors=np.full((len(points), 3), 128, np.uint8)))
     code, out = run(*clouds, "--method", method)
     assert code == 0
     assert "converged" in out
+    assert f"method           {method}, " in out
     for value in T[0]:
         assert f"{value:.6f}" in out
+    figures = json.loads(run(*clouds, "--method", method, "--json")[1])
+    assert figures["method"] == method
+
+
+def test_methods_are_those_of_the_api():
+    assert {method.value for method in Method} == {*METHODS, "closed-form"}
+
+
+def test_coloured_needs_colours(run, clouds):
+    with pytest.raises(InvalidInputError, match=r"source\.ply: has no colours, which --method coloured needs"):
+        run(*clouds, "--method", "coloured")
+
+
+class TestSet:
+    """`--set` reaches every setting of the local methods: defaults < --set < options."""
+
+    def test_a_lock(self, run, clouds):
+        """T turns about all axes; with planar locks the answer keeps z, roll and pitch of the identity."""
+        figures = json.loads(run(*clouds, "--set", "locks=planar", "--json")[1])
+        found = np.array(figures["T_target_source"])
+        np.testing.assert_allclose(found[2, :3], [0, 0, 1], atol=1e-12)
+        np.testing.assert_allclose(found[:3, 2], [0, 0, 1], atol=1e-12)
+
+    def test_it_is_the_setting_of_the_api(self, run, clouds):
+        options = ("--set", "kernel=tukey", "--set", "pairing=mutual", "--set", "method=gicp")
+        result = icp(*map(read_ply, clouds), config=IcpConfig(method="gicp", kernel="tukey", pairing="mutual"))
+        figures = json.loads(run(*clouds, *options, "--json")[1])
+        assert figures["method"] == "gicp"
+        assert figures["T_target_source"] == result.T_target_source.tolist()
+        assert figures["num_iterations"] == result.num_iterations
+
+    def test_options_win(self):
+        chosen = settings(
+            Method.GICP, scale=True, explain=False, use_global=False, voxel=0.1, max_distance=0.5,
+            overrides=["method=symmetric", "voxel_m=9", "max_correspondence_distance_m=9", "min_overlap=0.4"],
+        )  # fmt: skip
+        assert chosen.icp == IcpConfig(
+            method="gicp", scale="least_squares", voxel_m=0.1, max_correspondence_distance_m=0.5, min_overlap=0.4
+        )
+
+    def test_nothing_set_is_the_default(self):
+        def config(method=None, **given):
+            nothing = {"scale": False, "explain": False, "use_global": False, "voxel": None, "max_distance": None}
+            return settings(method, **{**nothing, "overrides": [], **given}).icp
+
+        assert config() == IcpConfig()
+        assert config(explain=True) == IcpConfig(method="point-to-point")
+        assert config(scale=True) == IcpConfig(scale="least_squares")
+        assert config(Method.POINT_TO_POINT, scale=True).scale == "symmetric"
+
+    @pytest.mark.parametrize(
+        ("override", "words"),
+        [
+            ("kernal=tukey", "--set: unknown key 'kernal'; did you mean 'kernel'"),
+            ("kernel=tukay", "--set: kernel = 'tukay': expected one of"),
+            ("min_overlap=2", "--set: min_overlap = 2.* from 0.0 to 1.0"),
+            ("locks=up", "'up' is none of x, y, z"),
+            ("kernel", "expected key=value"),
+        ],
+    )
+    def test_what_is_wrong_is_named(self, run, clouds, override, words):
+        with pytest.raises(ConfigError, match=words):
+            run(*clouds, "--set", override)
+
+
+@pytest.fixture(scope="module")
+def scans(tmp_path_factory):
+    """Frames 75 and 25 of the room as PLY files, the first moved by T_moved, and the true T_target_source."""
+    folder = tmp_path_factory.mktemp("scans")
+    sequence = SyntheticSequence(RenderConfig(width=160, height=120))
+    T_world_camera = sequence.ground_truth.T_world_camera
+    T_moved = se3.from_quaternion_xyzw([0.3, -0.5, 0.2, 0.7], [1, -2, 0.5])
+    for name, index, T_name_camera in (("source", 75, T_moved), ("target", 25, np.eye(4))):
+        frame = sequence.read(index)
+        points = frame.camera.back_project(frame.depth_m)[frame.depth_m > 0]
+        write_ply(folder / f"{name}.ply", PointCloud(se3.transform_points(T_name_camera, points)))
+    truth = se3.inverse(T_world_camera[25]) @ T_world_camera[75] @ se3.inverse(T_moved)
+    return folder / "source.ply", folder / "target.ply", truth
+
+
+class TestGlobal:
+    """Scans of a rendered room, the source anywhere."""
+
+    @pytest.mark.parametrize("options", [(), ("--method", "point-to-plane", "--voxel", 0.03)])
+    def test_no_first_guess_is_needed(self, run, scans, options):
+        source, target, truth = scans
+        code, out = run(source, target, "--global", "--json", *options)
+        figures = json.loads(out)
+        assert code == 0
+        assert set(figures) >= KEYS
+        error = np.array(figures["T_target_source"]) @ se3.inverse(truth)
+        assert np.linalg.norm(error[:3, 3]) < 0.005
+        assert np.degrees(se3.rotation_angle_rad(error)) < 0.2
+        assert figures["method"] == ("global, then point-to-plane" if options else "global, then gicp")
+        assert figures["overlap"] > 0.6
+
+    def test_the_local_methods_alone_do_not_reach_it(self, run, scans):
+        assert run(*scans[:2], "--json")[0] == 3
+
+    def test_unrelated_clouds_exit_with_3(self, run, scans, tmp_path):
+        """Forty balls are no room."""
+        rng = np.random.default_rng(0)
+        directions = rng.normal(size=(20_000, 3))
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        centers = rng.uniform(-2, 2, (40, 3))[rng.integers(0, 40, 20_000)]
+        write_ply(tmp_path / "balls.ply", PointCloud(centers + 0.3 * directions))
+        code, out = run(tmp_path / "balls.ply", scans[1], "--global", "--json")
+        figures = json.loads(out)
+        assert code == 3
+        assert figures["status"] in ("no_overlap", "too_few_correspondences")
+        assert figures["covariance"] is None
+        assert figures["note"]
+
+    def test_its_settings(self, run, scans):
+        with pytest.raises(ConfigError, match=r"unknown key 'global\.hypothesis'; did you mean 'global\.hypotheses'"):
+            run(*scans[:2], "--global", "--set", "global.hypothesis=3")
+        with pytest.raises(ConfigError, match="unknown key 'global'"):
+            run(*scans[:2], "--set", "global.hypotheses=3")
+
+    def test_the_plane_is_an_error(self, run, tmp_path):
+        np.save(tmp_path / "a.npy", np.random.default_rng(0).normal(size=(200, 2)))
+        with pytest.raises(InvalidInputError, match="needs points in 3-D"):
+            run(tmp_path / "a.npy", tmp_path / "a.npy", "--global")
+
+
+def test_seconds_are_those_of_the_alignment_alone():
+    """Loading kernels (here a nap of 0.3 s) comes before the clock starts."""
+    seen = []
+
+    def warm(source, target):
+        seen.append((len(source), len(target)))
+        time.sleep(0.3)
+        return "warm"
+
+    result = align_closed_form(np.eye(3), np.eye(3))
+    cloud = PointCloud(np.zeros((20_000, 3)))
+    found, seconds = run_timed(Aligner("nap", lambda a, b: result, warm), cloud, cloud)
+    assert found.T_target_source is result.T_target_source
+    assert seconds < 0.2
+    assert seen == [(5000, 5000)]  # a sample of 20 000
 
 
 def test_the_aligned_source_and_the_picture_are_written(run, clouds, tmp_path):
@@ -88,6 +245,13 @@ def test_the_aligned_source_and_the_picture_are_written(run, clouds, tmp_path):
     np.testing.assert_allclose(read_ply(tmp_path / "aligned.ply").points_m, read_ply(clouds[1]).points_m, atol=2e-3)
     assert (tmp_path / "plot.png").read_bytes().startswith(b"\x89PNG")
     assert str(tmp_path / "aligned.ply") in out
+
+
+@pytest.mark.parametrize("name", ["a.pcd", "a.xyz", "a.csv", "a.txt", "a.npy"])
+def test_the_ending_chooses_the_format(run, clouds, tmp_path, name):
+    assert run(*clouds, "--out", tmp_path / name)[0] == 0
+    np.testing.assert_allclose(read_points(tmp_path / name).points_m, read_ply(clouds[1]).points_m, atol=2e-6)
+    assert run(tmp_path / name, clouds[1])[0] == 0  # it reads back, too
 
 
 def test_scale(run, tmp_path):
@@ -103,15 +267,19 @@ def test_scale(run, tmp_path):
     assert np.shape(figures["information"]) == (3, 3)
     near = 1.03 * a + [0.01, -0.02]
     np.savetxt(tmp_path / "b.xyz", near)
-    figures = json.loads(run(tmp_path / "a.csv", tmp_path / "b.xyz", "--scale", "--json")[1])
-    assert figures["scale"] == pytest.approx(1.03)
+    for method in ("point-to-plane", "point-to-point", "gicp"):
+        options = () if method == "point-to-plane" else ("--method", method)
+        figures = json.loads(run(tmp_path / "a.csv", tmp_path / "b.xyz", "--scale", "--json", *options)[1])
+        assert figures["method"] == method
+        assert figures["scale"] == pytest.approx(1.03)
+        assert figures["scale_std"] >= 0
 
 
 def test_a_first_guess_and_a_gate(run, clouds, tmp_path):
     np.savetxt(tmp_path / "T.txt", T)
     figures = json.loads(run(*clouds, "--init", tmp_path / "T.txt", "--max-distance", 0.01, "--json")[1])
     assert figures["status"] == "converged"
-    assert figures["num_iterations"] == 1
+    assert figures["num_iterations"] <= 3  # nothing is left to do
 
 
 def test_a_plane_is_degenerate_and_says_so(run, tmp_path):
@@ -196,13 +364,38 @@ def test_explain_reports_the_method_that_it_explains(run, small):
     assert "point-to-point" in run(*small, "--explain")[1].split("Verdict")[1]
 
 
-def test_explain_says_when_the_result_is_that_of_another_method(run, small):
-    out = run(*small, "--explain", "--method", "point-to-plane")[1]
-    assert out.startswith("The steps shown are those of point-to-point, the result is that of point-to-plane.\n")
-    assert "point-to-plane, " in out.split("Verdict")[1]
+@pytest.mark.parametrize("method", ["point-to-plane", "symmetric", "gicp"])
+def test_explain_follows_every_method(run, small, method):
+    code, out = run(*small, "--explain", "--method", method)
+    steps, result = out.split("Verdict")
+    assert code == 0
+    assert steps.startswith(f"ICP, {method}: 150 source and 150 target points in 3-D")
+    assert f"method           {method}, " in result
+    assert steps.count("    H = sum w J^T J") == steps.count("\nStep ") > 1
+    # The last step's T is the reported one.
+    shown = np.array([line.split() for line in steps.split("T after step")[-1].splitlines()[1:5]], float)
+    found = np.array(json.loads(run(*small, "--method", method, "--json")[1])["T_target_source"])
+    np.testing.assert_allclose(shown, found, atol=6e-5)
+
+
+def test_explain_shows_a_scale(run, small):
     out = run(*small, "--explain", "--scale")[1]
-    assert out.startswith("The steps shown are those without a scale, the result is the one with it.\n")
-    assert "The steps shown" not in run(*small, "--explain")[1]
+    assert out.startswith("ICP, point-to-point")
+    assert "scaled by" in out.split("Verdict")[1]
+    assert "  s = " in out
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--method", "gicp", "--scale"), "--explain: scale = 'least_squares' with gicp cannot be explained"),
+        (("--set", "kernel=huber"), "--explain: kernel = 'huber' with point-to-point"),
+        (("--method", "point-to-plane", "--set", "anderson=5"), "--explain: anderson = 5"),
+    ],
+)
+def test_explain_says_what_it_cannot_show(run, small, options, words):
+    with pytest.raises(InvalidInputError, match=words):
+        run(*small, "--explain", *options)
 
 
 def test_explain_refuses_large_sets_before_aligning(run, clouds, monkeypatch):
@@ -231,9 +424,12 @@ def test_explain_with_files(run, tmp_path, dimension, capsys):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("--method", "gicp"), "point-to-plane"),
-        (("--scale", "--method", "point-to-plane"), "--scale works with"),
-        (("--method", "closed-form", "--voxel", "0.1"), "row i"),
+        (("--method", "icp"), "point-to-plane"),
+        (("--method", "closed-form", "--voxel", "0.1"), "row i with row i: it takes no --voxel"),
+        (("--method", "closed-form", "--set", "kernel=huber"), "it takes no --set"),
+        (("--method", "closed-form", "--global"), "it takes no --global"),
+        (("--global", "--init", "T.txt"), "leave out --init"),
+        (("--global", "--explain"), "leave out --global"),
         (("--threads", "0"), "greater than or equal to 1"),
     ],
 )
@@ -318,8 +514,9 @@ class TestOutputs:
     @pytest.mark.parametrize(
         ("option", "name", "words"),
         [
-            ("--out", "a.xyz", r"must end in \.ply, got '\.xyz'"),
-            ("--out", "a", r"must end in \.ply, got a name without ending"),
+            ("--out", "a.e57", r"must end in \.ply or \.pcd or .*, got '\.e57'"),
+            ("--out", "a.obj", r"must end in \.ply or \.pcd or .*, got '\.obj'"),
+            ("--out", "a", r"must end in \.ply or .*, got a name without ending"),
             ("--plot", "a.ply", r"must end in \.png or \.pdf or \.svg, got '\.ply'"),
             ("--out", "no/a.ply", "--out .* cannot be written: .*No such file"),
             ("--plot", "no/a.png", "--plot .* cannot be written: .*No such file"),
@@ -356,8 +553,112 @@ def test_one_is_singular(run, clouds):
     assert "1 pair, 3 are needed in 3-D" in run(one, one, "--method", "closed-form")[1]
 
 
+class TestBadInput:
+    """What a newcomer gives: an exit code, one line where there is no answer, and never a NaN."""
+
+    @pytest.fixture
+    def command(self, capsys, clouds):
+        """Run the whole command line with one of the inputs replaced; the other is a good cloud."""
+
+        def call(name, content, *options, replaced=0):
+            files = list(clouds)
+            files[replaced] = clouds[0].parent / name
+            if isinstance(content, bytes):
+                files[replaced].write_bytes(content)
+            elif content is not None:
+                np.save(files[replaced], content)
+            capsys.readouterr()
+            code = command_line(["register", *map(str, files), "--json", *map(str, options)])
+            return code, *capsys.readouterr()
+
+        return call
+
+    HEADER = b"ply\nformat binary_little_endian 1.0\nelement vertex 1000000000000\nproperty float x\nproperty float y\n"
+
+    @pytest.mark.parametrize(
+        ("name", "content", "words"),
+        [
+            ("a.ply", HEADER + b"property float z\nend_header\n" + bytes(120), "promises 1000000000000 x vertex"),
+            ("a.ply", b"\x89PNG", "not a PLY file"),
+            ("a.ply", b"", "not a PLY file"),
+            ("none.ply", None, "no such file"),
+            ("a.obj", b"v 1 2 3", "cannot read '.obj'"),
+            ("a.csv", b"1,2,3\n4,5\n", "line 2: expected 3 columns"),
+            ("a.csv", b"1,2\n3,4\n5,6\n", "is 2-D and"),
+            ("a.npy", np.zeros((5, 4)), "got 4"),
+        ],
+    )
+    def test_a_file_that_is_none_is_one_line(self, command, name, content, words):
+        code, out, err = command(name, content)
+        assert (code, out) == (1, "")
+        assert err.startswith("error: ")
+        assert err.count("\n") == 1
+        assert words in err
+
+    @pytest.mark.parametrize("options", [(), ("--method", "point-to-point"), ("--method", "gicp")])
+    @pytest.mark.parametrize("replaced", [0, 1])
+    @pytest.mark.parametrize(
+        "points",
+        [
+            np.zeros((0, 3)),
+            np.ones((1, 3)),
+            np.ones((400, 3)),
+            np.column_stack([np.linspace(0, 1, 400), np.zeros((400, 2))]),
+            np.full((50, 3), np.nan),
+            np.random.default_rng(0).normal(size=(500, 3)) + 1000,
+        ],
+        ids=["empty", "one", "coincident", "line", "nan", "far"],
+    )
+    def test_points_without_an_answer_exit_with_3(self, command, points, replaced, options):
+        code, out, err = command("odd.npy", points, *options, replaced=replaced)
+        figures = json.loads(out, parse_constant=lambda name: pytest.fail(name))  # NaN and Infinity are no JSON
+        assert code == 3
+        assert figures["status"] in ("too_few_correspondences", "degenerate", "no_overlap")
+        assert figures["note"]
+        assert "Traceback" not in err
+
+    def test_rows_that_are_not_finite_are_counted(self, command, clouds):
+        points = read_ply(clouds[0]).points_m.copy()
+        points[::10] = np.inf
+        code, out, err = command("holes.npy", points)
+        assert code == 0
+        np.testing.assert_allclose(json.loads(out)["T_target_source"], T, atol=1e-6)
+        assert "90 of 900 points are not finite and were dropped" in err
+
+    @pytest.mark.parametrize(
+        "options", [("--threads", 0), ("--method", "icp"), ("--no-such",), ("--global", "--explain")]
+    )
+    def test_wrong_usage_exits_with_2(self, command, clouds, options):
+        code, out, err = command(clouds[0].name, None, *options)
+        assert (code, out) == (2, "")
+        assert "Traceback" not in err
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+def test_a_full_disk_is_one_line(clouds):
+    """Standard output that takes nothing."""
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(
+            [sys.executable, "-m", "scanweld", "register", *map(str, clouds)],
+            stdout=full, stderr=subprocess.PIPE, text=True, check=False,
+        )  # fmt: skip
+    assert done.returncode == 1
+    assert done.stderr.splitlines()[-1] == "error: [Errno 28] No space left on device"
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.skipif(os.name == "nt", reason="needs a POSIX shell")
+def test_a_reader_may_leave(clouds):
+    done = subprocess.run(
+        ["/bin/sh", "-c", f"'{sys.executable}' -m scanweld register '{clouds[0]}' '{clouds[1]}' | head -1"],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.stdout.startswith("status ")
+    assert "Traceback" not in done.stderr
+
+
 def test_help_names_every_option(run):
     text = re.sub(r"\x1b\[[0-9;]*m", "", run("--help")[1])
-    for option in ("--method", "--scale", "--init", "--voxel", "--max-distance", "--threads", "--explain", "--plot",
-                   "--out", "--json"):  # fmt: skip
+    for option in ("--method", "--scale", "--init", "--global", "--voxel", "--max-distance", "--set", "--threads",
+                   "--explain", "--plot", "--out", "--json"):  # fmt: skip
         assert option in text
