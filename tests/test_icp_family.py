@@ -245,7 +245,7 @@ class TestColour:
         found = intensity_gradients(points, normals, values, build_index(points), 12)
         inner = (np.abs(xy - 1.5) < 1.3).all(axis=1)
         expected = np.column_stack([0.6 * np.cos(2 * points[:, 0]), np.zeros((len(points), 2))])
-        np.testing.assert_allclose(found[inner], expected[inner], atol=0.03)
+        np.testing.assert_allclose(found[inner], expected[inner], atol=0.035)
         np.testing.assert_allclose((found * normals).sum(axis=1), 0, atol=1e-12)
 
     def test_a_gradient_across_the_tilt(self):
@@ -316,18 +316,35 @@ class TestScale:
         assert result.status is Status.CONVERGED
         assert result.scale == pytest.approx(0.97, abs=1e-6)
 
-    @SURFACES
+    @pytest.mark.parametrize("method", ["symmetric", "gicp"])
     def test_its_deviation_is_that_of_the_answers(self, method):
-        """40 samples: the mean of (s - 1)^2 / std^2 has the deviation sqrt(2 / 40) = 0.22 about 1. No ball: a point
-        between those of a ball lies below their tangent planes by d^2 / (2 R), a bias of point-to-plane."""
+        """40 samples: the mean of (s - 1)^2 / std^2 has the deviation sqrt(2 / 40) = 0.22 about 1. Not point-to-plane:
+        a point between those of a curved target lies off their tangent planes by d^2 / (2 R), which is no scatter but
+        a bias of the scale."""
         errors = []
         for seed in range(40):
-            source, target = (p[np.linalg.norm(p - [2, 1.5, 0.5], axis=1) > 0.6] for p in
-                              (room(1500, 2 * seed + 1, 0.005), room(1500, 2 * seed + 2, 0.005)))  # fmt: skip
-            result = icp(source, target, config=IcpConfig(method=method, scale="least_squares", attempts=0))
+            source, target = room(1500, 2 * seed + 1, 0.005), room(1500, 2 * seed + 2, 0.005)
+            config = IcpConfig(method=method, scale="least_squares", attempts=0)
+            result = icp(source, target, config=config)
             assert result.scale_std > 0
             errors.append(((result.scale - 1) / result.scale_std) ** 2)
         assert 0.45 < np.mean(errors) < 1.75
+
+    @FAMILY
+    @pytest.mark.parametrize("shape", ["corner", "plane"])
+    def test_what_tells_no_scale(self, method, shape):
+        """Three planes through a point are the same at any scale about it; so is one."""
+
+        def make(seed: int) -> np.ndarray:
+            rng = np.random.default_rng(seed)
+            points = rng.uniform(0, 2, (1500, 3))
+            points[np.arange(1500), rng.integers(0, 3, 1500) if shape == "corner" else 2] = 0
+            return points
+
+        result = icp(1.02 * make(1), make(2), config=IcpConfig(method=method, scale="least_squares", attempts=0))
+        assert result.status is Status.DEGENERATE
+        assert "scale" in [direction.words for direction in result.unobservable]
+        assert result.scale == 1
 
     def test_it_is_one_unless_asked_for(self):
         target = room(2000, 0)
@@ -354,19 +371,43 @@ class TestRobustness:
 
         assert error(kernel) < 0.25 * error("none")
 
+    @pytest.mark.parametrize("kernel", ["cauchy", "geman_mcclure"])
     @SURFACES
-    def test_many_outliers_with_a_narrowing_kernel(self, method):
+    def test_many_outliers_with_a_narrowing_kernel(self, method, kernel):
         """A third of the points hangs 5 to 30 cm over the floor and before the walls, all on the same side."""
         rng = np.random.default_rng(0)
         target = room(3000, 0)
         source = target.copy()
-        source[::3] += rng.uniform(0.05, 0.3, (1000, 1)) * [1.0, 1.0, 1.0]
-        config = IcpConfig(method=method, kernel="tukey", graduated=True, attempts=0)
+        source[::3] += rng.uniform(0.05, 0.3, (1000, 1))
+        config = IcpConfig(method=method, kernel=kernel, graduated=True, attempts=0)
         result = icp(back(source), target, config=config)
         assert result.status is Status.CONVERGED
-        assert pose_error(result, MOTION)[0] < 2e-3
+        assert pose_error(result, MOTION)[0] < 1e-3
         plain = icp(back(source), target, config=IcpConfig(method=method, kernel="none", attempts=0))
         assert pose_error(plain, MOTION)[0] > 0.02
+
+    def test_half_of_the_points_are_outliers(self):
+        """Started narrow, the kernel settles on a compromise; narrowing, it finds the half that agrees."""
+        rng = np.random.default_rng(0)
+        target = room(3000, 0)
+        rng.uniform(size=1000)
+        source = target.copy()
+        source[::2] += rng.uniform(0.05, 0.3, (1500, 1))
+
+        def error(graduated: bool) -> float:
+            config = IcpConfig(method="gicp", graduated=graduated, attempts=0, coarse_to_fine=False)
+            return pose_error(icp(back(source), target, config=config), MOTION)[0]
+
+        assert error(True) < 1e-3
+        assert error(False) > 0.02
+
+    def test_steps_of_no_length_end_the_narrowing(self):
+        """From the exact answer the first step is 0, and the schedule has just begun."""
+        target = room(1000, 0)
+        for kernel in ("cauchy", "trimmed"):
+            result = icp(target, target, config=IcpConfig(method="gicp", graduated=True, kernel=kernel))
+            assert result.status is Status.CONVERGED
+            np.testing.assert_allclose(result.T_target_source, np.eye(4), atol=1e-12)
 
     def test_trimmed_point_to_point_on_a_partial_copy(self):
         """A sixth of the source has no counterpart: its pairs with the rim pull on the plain sum, and are trimmed."""

@@ -54,9 +54,8 @@ class Pairs:
         chunks = -(-len(self.source) // kernels.CHUNK)
         partials = np.empty((chunks, kernels.SUMS))
         target, *rest = self.arguments()
-        kernels.pair_sums(
-            metric, 0, chunks, self.moved, self.partner, weights, target, *rest, noise, np.array(robust, float), partials
-        )
+        code = np.array(robust, float)
+        kernels.pair_sums(metric, 0, chunks, self.moved, self.partner, weights, target, *rest, noise, code, partials)
         total = partials.sum(axis=0)
         full = np.zeros((8, 8))
         full[np.triu_indices(8)] = total[:36]

@@ -214,7 +214,9 @@ def _candidates(
     config: GlobalConfig,
 ) -> tuple[list[_Candidate], int]:
     """Return the motions that surfaces and free space allow, the best first, and the number of matches."""
-    motions, num_matches = propose(source, target, config.hypotheses, scale=scale)
+    motions, num_matches = propose(
+        source, target, config.hypotheses, scale=scale, source_view=views[0], target_view=views[1]
+    )
     candidates = []
     for motion in motions:
         agreement = assess(source, target, motion.T, motion.scale, *views)

@@ -1,7 +1,7 @@
-"""Motions that many feature matches agree on, the best supported first.
+"""Motions that feature matches agree on, and that the free space of both scans allows.
 
-The largest set of consistent matches gives the first motion; without the matches that agree with it, the largest set
-of the rest gives the next. Rooms repeat themselves: the right motion is often not the one with the most matches.
+Every match is the seed of a set of consistent matches, and every such set of a motion. Rooms repeat themselves: the
+right motion is often not the one that most matches agree on, so many are kept, and looked at with the surfaces.
 """
 
 from __future__ import annotations
@@ -12,10 +12,12 @@ import numpy as np
 
 from scanweld.arrays import Float64, Int64
 from scanweld.geometry import se3
-from scanweld.registration.closed_form import align_closed_form
-from scanweld.registration.consistency.clique import largest_clique
+from scanweld.parallel import run_ranges
+from scanweld.registration.closed_form import PairFit, align_closed_form, fit_pairs
 from scanweld.registration.consistency.graph import consistency_graph
 from scanweld.registration.features.matching import mutual_matches, nearest_features
+from scanweld.registration.global_search.agreement import DepthMap, conflict
+from scanweld.registration.global_search.kernels import count_agreeing, grow_cliques
 from scanweld.registration.global_search.scan import Scan
 from scanweld.registration.result import RegistrationResult
 from scanweld.registration.robust_pairs import align_clique
@@ -24,12 +26,17 @@ CANDIDATES = 2
 """A match counts when each feature is among so many of the other's nearest."""
 
 _BOUND = 1.0  # voxels that a right match may be off: its points are means of voxels that lie differently
-_AGREE = 1.5  # voxels within which a match agrees with a motion
+_AGREE = 1.5  # voxels within which a match agrees with a refined motion ...
+_ROUGHLY = 2.0  # ... and with a rough one
 _MAX_TURN = 0.3  # difference of the cosines between normals and lines of two consistent matches
 _MIN_LENGTH = 2.0  # voxels; nearer matches are evidence of the same thing
-_MIN_CLIQUE = 4
-_MAX_NODES = 300  # the next set is as good: the search need not be exact here
-_SAME = 3.0  # voxels between two motions of the source, on average, that make them one
+_MIN_CLIQUE, _MAX_CLIQUE = 4, 64  # members of a set; more do not make its motion better
+_KEPT = 150  # rough motions to compare with the free space
+_MAX_CONFLICT = 0.08  # share of the points in free space at a rough motion
+_CONFLICT_POINTS = 600
+_SCALE_SLACK = 0.15  # how far the ratio of the clouds' sizes may be from the scale, relative
+_PLACES = 64  # points that tell how far apart two motions are
+_DIFFERENT, _SAME = 5.0, 3.0  # voxels between two rough motions, on average, that make them two; and two refined ones
 _WIDE, _TIGHT = 3.0, 1.5  # gates of the refinement, voxels
 _WIDE_STEPS, _STEPS = 4, 10
 _CAUCHY = 2.3849
@@ -62,34 +69,23 @@ class Hypothesis:
         return se3.transform_points(self.T, self.scale * points)
 
 
-def propose(source: Scan, target: Scan, count: int, *, scale: bool = False) -> tuple[list[Hypothesis], int]:
+def propose(
+    source: Scan,
+    target: Scan,
+    count: int,
+    *,
+    scale: bool = False,
+    source_view: DepthMap | None = None,
+    target_view: DepthMap | None = None,
+) -> tuple[list[Hypothesis], int]:
     """Return at most `count` different motions, refined on the thinned surfaces, and the number of matches."""
     forward, backward = nearest_features(source.features, target.features, CANDIDATES)
     i, j = mutual_matches(forward, backward)
     voxel = target.voxel_m
-    ratio = voxel / source.voxel_m if scale else 1.0  # features of the same size are compared
     a, b = source.points[i], target.points[j]
-    bounds = np.full(len(i), _BOUND * voxel)
-    graph = consistency_graph(
-        a,
-        b,
-        bounds,
-        normals=(source.normals[i], target.normals[j]),
-        oriented=source.oriented,
-        max_turn=_MAX_TURN,
-        scale=ratio,
-        slack=0.1 if scale else 0.0,
-        min_length_m=_MIN_LENGTH * voxel,
-    )
-    alive = np.ones(len(i), np.bool_)
     found: list[Hypothesis] = []
-    for _ in range(2 * count):
-        clique = largest_clique(graph, alive=alive, at_least=_MIN_CLIQUE, max_nodes=_MAX_NODES)
-        if len(clique) < _MIN_CLIQUE or len(found) == count:
-            break
-        inliers, fit = align_clique(a, b, _AGREE * bounds, clique.vertices, scale=scale)
-        alive[clique.vertices] = False
-        alive &= ~inliers
+    for clique in _consistent_sets(source, target, i, j, scale, (source_view, target_view)):
+        _, fit = align_clique(a, b, np.full(len(a), _AGREE * voxel), clique, scale=scale)
         T, s = refine(source, target, fit.T_target_source, fit.scale if scale else 1.0, free_scale=scale)
         agree = np.linalg.norm(se3.transform_points(T, s * a) - b, axis=1) <= _AGREE * voxel
         moved = se3.transform_points(T, s * source.points)
@@ -98,7 +94,61 @@ def propose(source: Scan, target: Scan, count: int, *, scale: bool = False) -> t
         hypothesis = Hypothesis(T, s, support, len(clique), spread)
         if all(distance(hypothesis, other, source.points) > _SAME * voxel for other in found):
             found.append(hypothesis)
+        if len(found) == count:
+            break
     return found, len(i)
+
+
+def _consistent_sets(
+    source: Scan, target: Scan, i: Int64, j: Int64, scale: bool, views: tuple[DepthMap | None, DepthMap | None]
+) -> list[Int64]:
+    """Return sets of matches that are consistent, of different motions that free space allows, most agreed on first."""
+    voxel = target.voxel_m
+    a, b = source.points[i], target.points[j]
+    graph = consistency_graph(
+        a,
+        b,
+        np.full(len(i), _BOUND * voxel),
+        normals=(source.normals[i], target.normals[j]),
+        oriented=source.oriented,
+        max_turn=_MAX_TURN,
+        scale=voxel / source.voxel_m,  # features of the same size are compared: 1 where the scale is known
+        slack=_SCALE_SLACK if scale else 0.0,
+        min_length_m=_MIN_LENGTH * voxel,
+    )
+    sizes, members = np.zeros(len(i), np.int64), np.empty((len(i), _MAX_CLIQUE), np.int64)
+    everyone = np.full(graph.shape[1], ~np.uint64(0))
+    run_ranges(len(i), lambda start, stop: grow_cliques(start, stop, graph, everyone, sizes, members))
+    cliques = [members[seed, : sizes[seed]] for seed in np.flatnonzero(sizes >= _MIN_CLIQUE)]
+    kind = "least_squares" if scale else "none"
+    fits = [fit_pairs(a, b, source_rows=clique, target_rows=clique, scale=kind) for clique in cliques]
+    motions = np.array([np.concatenate([f.scale * f.rotation, f.translation_m[:, None]], axis=1) for f in fits])
+    motions = np.ascontiguousarray(motions.reshape(-1, 3, 4))
+    counts = np.empty(len(motions), np.int64)
+    run_ranges(len(motions), lambda lo, hi: count_agreeing(lo, hi, motions, a, b, _ROUGHLY * voxel, counts))
+    places = source.points[:: -(-len(source.points) // _PLACES)]
+    landings = np.einsum("pij,nj->pni", motions[:, :, :3], places) + motions[:, None, :, 3]
+    kept: list[int] = []
+    for k in np.argsort(-counts, kind="stable"):
+        if len(kept) == _KEPT:
+            break
+        if not kept or np.linalg.norm(landings[kept] - landings[k], axis=2).mean(axis=1).min() > _DIFFERENT * voxel:
+            kept.append(int(k))
+    return [cliques[k] for k in kept if _rough_conflict(source, target, fits[k], views) <= _MAX_CONFLICT]
+
+
+def _rough_conflict(source: Scan, target: Scan, fit: PairFit, views: tuple[DepthMap | None, DepthMap | None]) -> float:
+    """Share of some points of either scan that stand in the free space of the other."""
+    worst = 0.0
+    if views[1] is not None:
+        some = source.points[:: -(-len(source.points) // _CONFLICT_POINTS)]
+        moved = fit.scale * some @ fit.rotation.T + fit.translation_m
+        worst = max(worst, conflict(moved, views[1], target.voxel_m))
+    if views[0] is not None:
+        some = target.points[:: -(-len(target.points) // _CONFLICT_POINTS)]
+        moved = (some - fit.translation_m) @ fit.rotation / fit.scale
+        worst = max(worst, conflict(moved, views[0], source.voxel_m))
+    return worst
 
 
 def _support(points: Float64, others: Float64, nearest: Int64, voxel_m: float) -> int:

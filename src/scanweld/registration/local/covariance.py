@@ -79,12 +79,15 @@ def slope(
     places = pairs.moved[some]
     jacobian = np.concatenate([point_jacobian(places), places[:, :, None]], axis=2)[:, : len(axes)]
     A = np.einsum("ani,naj->ij", ahead - behind, jacobian) / (2 * step)
-    return stride * (A + A.T) / 2
+    return np.asarray(stride * (A + A.T) / 2)
 
 
 def softened(H: Float64, A: Float64) -> Float64:
     """Return A (K, K), held between a hundredth of H, positive definite, and H, which fixed pairs would give."""
     values, vectors = np.linalg.eigh(H)
+    if not values[-1] > 0:  # all weights are zero, and so is the scatter
+        return np.eye(len(H))
+    values = np.maximum(values, 1e-12 * values[-1])
     root, inverse = vectors * np.sqrt(values), vectors / np.sqrt(values)
     shares, turned = np.linalg.eigh(inverse.T @ A @ inverse)
     root = root @ turned

@@ -115,7 +115,7 @@ def iterate(
         sway = max(sway, displacement)
         cycles = back <= small and sway <= _CYCLE_SPACINGS * problem.spacing
         # Steps that shrink by a constant factor have so much left to go.
-        shrinking, last = min(displacement / last, 1.0), displacement
+        shrinking, last = min(displacement / max(last, 1e-300), 1.0), displacement
         ahead_m = displacement * shrinking / max(1 - shrinking, 1e-9)
         noise_only = max(displacement, ahead_m) <= settled * step.deviation_m
         if true_kernel and (displacement <= small or cycles or noise_only):

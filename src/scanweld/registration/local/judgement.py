@@ -22,7 +22,7 @@ from scanweld.registration.local.problem import (
     Problem,
     neighbours_of,
 )
-from scanweld.registration.local.steps import in_space_twist, min_constraint, unlocked_spectrum, with_prior
+from scanweld.registration.local.steps import holds_scale, in_space_twist, min_constraint, unlocked_spectrum, with_prior
 from scanweld.registration.plausibility import SAMPLE, Evidence, doubt, gather_evidence
 from scanweld.registration.residuals import normal_equations, point_to_plane
 from scanweld.registration.result import FreeDirection, RegistrationResult, Status
@@ -89,6 +89,9 @@ def judge(end: Descent, config: IcpConfig) -> RegistrationResult:
             equations, parts = with_prior(equations, data, problem, motion, noise.geometric)
         knowledge = _Knowledge(data, parts)
         free = free_directions(equations, parts)
+        if config.scale != "none" and not _scale_held(problem, config, motion, pairs, evidence):
+            free = (*free, FreeDirection("scale", np.zeros(len(equations.gradient))))
+            motion = Motion(motion.T, problem.start.scale)
         if free:
             status = Status.DEGENERATE
             notes.append(f"the data leaves free: {', '.join(direction.words for direction in free)}")
@@ -163,22 +166,43 @@ def _constraints(
     parts = unlocked_spectrum(equations, problem, RANK_TOLERANCE)
     if not parts.observable.all() or evidence.coincident or not evidence.surfaces:
         return equations, parts
-    sliding = _sliding(problem, evidence)
-    return sliding, _held_by_surfaces(sliding, problem, evidence)
+    return _sliding(problem, evidence)
 
 
-def _sliding(problem: Problem, evidence: Evidence) -> NormalEquations:
-    """What the surfaces say, whatever the method."""
+def _scale_held(problem: Problem, config: IcpConfig, motion: Motion, pairs: Pairing, evidence: Evidence) -> bool:
+    """Whether the surfaces, or points that coincide, tell the scale."""
+    metric = METRICS[config.method]
+    if metric == kernels.POINT and evidence.surfaces and not evidence.coincident:
+        residuals, jacobian, weights = _surface_rows(problem, evidence)
+        columns = np.zeros((len(jacobian), 7))
+        columns[:, PLANE if problem.dimension == 2 else np.arange(6)] = jacobian
+        columns[:, 6] = np.einsum("nd,nd->n", evidence.normals, evidence.moved)
+        equations = normal_equations(evidence.moved, residuals, jacobian, weights)
+        return holds_scale(equations, (columns.T * weights) @ columns, problem, _least(problem, evidence))
+    metric = kernels.PLANE if metric == kernels.GENERALISED else metric
+    noise, sample = estimate_noise(problem, metric, pairs, motion, config.kernel_scale_m)
+    sums = linearise(problem, metric, pairs, motion, noise, kernel_of(config), sample)
+    return holds_scale(sums.equations, sums.similarity[0], problem, min_constraint(problem))
+
+
+def _surface_rows(problem: Problem, evidence: Evidence) -> tuple[Float64, Float64, Float64]:
+    """Return what the surfaces say, whatever the method: residuals (N,), Jacobians (N, K) and weights (N,)."""
     residuals, jacobian = point_to_plane(evidence.moved, evidence.partners, evidence.normals)
     # Normals at edges point anywhere; where they do, the residuals stand out.
     size = max(mad_scale(residuals), LEAST_NOISE * problem.spacing, 1e-300)
-    return normal_equations(evidence.moved, residuals, jacobian, Cauchy().weight(residuals / size))
+    return residuals, jacobian, Cauchy().weight(residuals / size)
 
 
-def _held_by_surfaces(equations: NormalEquations, problem: Problem, evidence: Evidence) -> Spectrum:
+def _sliding(problem: Problem, evidence: Evidence) -> tuple[NormalEquations, Spectrum]:
+    """Return the equations of the surfaces, and which directions they hold."""
+    equations = normal_equations(evidence.moved, *_surface_rows(problem, evidence))
+    return equations, unlocked_spectrum(equations, problem, _least(problem, evidence))
+
+
+def _least(problem: Problem, evidence: Evidence) -> float:
+    """Mean squared slope of the sample's surfaces below which a direction is free."""
     # Pairs lie apart along the surface, which on a curved one turns their normals as noise does.
-    least = 2 * max(min_constraint(problem), 3.0 * evidence.normal_variance)
-    return unlocked_spectrum(equations, problem, least)
+    return 2 * max(min_constraint(problem), 3.0 * evidence.normal_variance)
 
 
 def _pull(problem: Problem, config: IcpConfig, evidence: Evidence) -> str:
@@ -187,10 +211,11 @@ def _pull(problem: Problem, config: IcpConfig, evidence: Evidence) -> str:
     Points beyond the rim of the target pull on point-to-point, and on the others from afar; small steps do not tell.
     Right answers are within a tenth of a spacing of what point-to-plane would answer, of point-to-point within a third.
     """
-    if config.method == "coloured" or problem.prior is not None or evidence.coincident or not evidence.surfaces:
+    if config.method == "coloured" or problem.prior is not None or problem.uneven:  # the spacing says nothing there
         return ""
-    equations = _sliding(problem, evidence)
-    parts = _held_by_surfaces(equations, problem, evidence)
+    if evidence.coincident or not evidence.surfaces:
+        return ""
+    equations, parts = _sliding(problem, evidence)
     asked = float(np.linalg.norm(np.linalg.lstsq(parts.basis, solve(equations, parts), rcond=None)[0]))
     if asked <= (_PULLED_POINTS if config.method == "point-to-point" else _PULLED) * problem.spacing:
         return ""

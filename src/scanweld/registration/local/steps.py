@@ -61,21 +61,25 @@ def gauss_newton_step(
     metric = METRICS[config.method]
     sums = linearise(problem, metric, pairs, motion, noise, kernel, sample)
     equations, similarity = sums.equations, sums.similarity
-    if config.scale != "none":
+    surfaces = sums
+    if metric == kernels.GENERALISED and (config.scale != "none" or problem.prior is not None):
+        # Its leash along the surface is no knowledge.
+        surfaces = linearise(problem, kernels.PLANE, pairs, motion, noise, kernel, sample)
+    scaled = config.scale != "none" and holds_scale(
+        surfaces.equations, surfaces.similarity[0], problem, min_constraint(problem)
+    )
+    if scaled:
         equations = _without_scale(equations, similarity, problem.dimension)
     least = RANK_TOLERANCE if config.method == "point-to-point" else min_constraint(problem)
     parts = unlocked_spectrum(equations, problem, least)
     if problem.prior is not None:
-        if metric == kernels.GENERALISED:  # its leash along the surface is no knowledge
-            surfaces = linearise(problem, kernels.PLANE, pairs, motion, noise, kernel, sample).equations
-            parts = unlocked_spectrum(surfaces, problem, least)
+        if metric == kernels.GENERALISED:
+            parts = unlocked_spectrum(surfaces.equations, problem, least)
         equations, parts = with_prior(equations, parts, problem, motion, noise.geometric)
     xi = solve(equations, parts)
     xi = xi if problem.dimension == 3 else in_space_twist(xi)
     step = _split_step(xi) if config.method == "symmetric" else se3.exp(xi)
-    scale = 1.0
-    if config.scale != "none":
-        scale = _scale_step(xi, similarity)
+    scale = _scale_step(xi, similarity) if scaled else 1.0
     T = step @ motion.T
     T[:3, 3] *= scale
     deviation = noise.geometric * standard_deviation(equations, parts)
@@ -152,14 +156,16 @@ def with_prior(
     basis, known = parts.basis, parts.observable
     prior = basis.T @ (noise_m**2 * problem.prior.information) @ basis
     error = se3.log(motion.T @ se3.inverse(problem.prior.T_target_source))
-    slopes = np.where(known, basis.T @ equations.gradient, 0.0)
+    slopes: Float64 = np.where(known, basis.T @ equations.gradient, 0.0)
     slopes += basis.T @ (noise_m**2 * problem.prior.information @ error)
     data = basis.T @ equations.information @ basis * np.outer(known, known)
     inner = (data + prior) / total
     values, vectors = np.linalg.eigh(inner)
-    least = max((noise_m / problem.gate) ** 2 / total, 1e-15 * float(values[-1]))
+    least = max((noise_m / problem.gate) ** 2 / total, 1e-15 * float(values.max(initial=0.0)))
     back = np.linalg.pinv(basis)
-    both = replace(equations, information=total * back.T @ inner @ back, gradient=back.T @ slopes)
+    both = replace(
+        equations, information=np.asarray(total * back.T @ inner @ back), gradient=np.asarray(back.T @ slopes)
+    )
     return both, Spectrum(values, basis @ vectors, values > least)
 
 
@@ -176,6 +182,22 @@ def _split_step(xi: Float64) -> Float64:
     shift = np.eye(4)
     shift[:3, 3] = xi[:3]
     return np.asarray(half @ shift @ half)
+
+
+def holds_scale(equations: NormalEquations, similarity: Float64, problem: Problem, least: float) -> bool:
+    """Whether the data tells a scale from the motions that it tells; three planes that meet in a point do not.
+
+    Parameters
+    ----------
+    similarity : (7, 7), with the log scale last
+    least : mean squared slope below which a direction is free
+    """
+    parts = unlocked_spectrum(equations, problem, least)
+    twist = PLANE if problem.dimension == 2 else np.arange(6)
+    held = parts.basis[:, parts.observable]
+    along = held.T @ similarity[twist, 6]
+    left = similarity[6, 6] - along @ np.linalg.lstsq(held.T @ equations.information @ held, along, rcond=None)[0]
+    return bool(left > least * equations.total_weight * equations.radius_m**2)
 
 
 def _without_scale(equations: NormalEquations, similarity: tuple[Float64, Float64], dimension: int) -> NormalEquations:
