@@ -248,6 +248,7 @@ def add_scores(metric, stride, moved, partner, point_weights, target, normals, s
     components = 3 if metric == POINT or metric == GENERALISED else 1
     balance = (noise[0] / noise[1]) ** 2
     code = np.int64(robust[0])
+    levered = bread.any()
     for i in range(moved.shape[0]):
         j = partner[i]
         if j < 0 or (stride > 0 and j % stride != 0):
@@ -265,8 +266,12 @@ def add_scores(metric, stride, moved, partner, point_weights, target, normals, s
                 w = own * robust_weight(code, robust[1], robust[2], np.sqrt(squares[0, 0]) / noise[0])
             for a in range(7):
                 scores[k, a] += w * rows[c, a, 0] * rows[c, 7, 0]
-                for b in range(7):
-                    scores[k, 7] += w * rows[c, a, 0] * bread[a, b] * rows[c, b, 0]
+            if levered:
+                for a in range(7):
+                    product = 0.0
+                    for b in range(7):
+                        product += bread[a, b] * rows[c, b, 0]
+                    scores[k, 7] += w * rows[c, a, 0] * product
 
 
 @kernel
