@@ -27,6 +27,7 @@ from scanweld.config import check_ranges, setting
 from scanweld.errors import ConfigError, InvalidInputError
 from scanweld.geometry import se3
 from scanweld.geometry.foreign import as_cloud
+from scanweld.geometry.point_cloud import PointCloud, voxel_downsample
 from scanweld.parallel import limited_threads
 from scanweld.registration.global_search.agreement import DepthMap, SurfaceAgreement, assess, depth_map
 from scanweld.registration.global_search.hypotheses import Hypothesis, distance, propose
@@ -37,6 +38,7 @@ from scanweld.registration.result import RegistrationResult, Status
 logger = logging.getLogger(__name__)
 
 _MIN_POINTS = 100  # a cloud with fewer has no features to speak of
+_MIN_THINNED = 30  # points of a thinned cloud
 _STAGES = ((2.0, 0.5), (1.0, 0.5))  # gate and fineness of the final refinement, voxels
 _ASTRAY = 3.0  # voxels that the refinement may move the source, on average
 _USUAL_CONFLICT = 0.004  # share of conflict that true motions hardly reach
@@ -150,6 +152,10 @@ def _register(source: Any, target: Any, scale: bool, config: GlobalConfig) -> Re
     voxel_a, voxel_b = _voxels(local_a, local_b, scale, config)
     if not (voxel_a > 0 and voxel_b > 0):
         return _nothing(Status.DEGENERATE, "the points of a cloud are in one place", dropped)
+    thinned = [len(voxel_downsample(PointCloud(p), v)) for p, v in ((local_a, voxel_a), (local_b, voxel_b))]
+    if min(thinned) < _MIN_THINNED:
+        words = f"{min(thinned)} points are left of a cloud in voxels of {voxel_b:.3g} m, {_MIN_THINNED} are needed; "
+        return _nothing(Status.DEGENERATE, words + "is one cloud far smaller than the other, or in one place?", dropped)
     scans, views = _scans(local_a, local_b, voxel_a, voxel_b, config)
     candidates, num_matches = _candidates(*scans, views, scale, config)
     if not candidates:

@@ -93,7 +93,8 @@ def align_pairs_robustly(
     clique, ratio = _consistent_set(a, b, bounds, scale, max_nodes)
     chance = size_by_chance(a, b, bounds, scale=ratio, seed=seed, slack=_SCALE_STEP / 2 if scale else 0.0)
     inliers, fit = align_clique(a, b, bounds, clique.vertices, scale=scale)
-    if len(clique) > max(chance, dimension) and inliers[clique.vertices].mean() < _MIRRORED:
+    # Well beyond chance, or two pairs that agree by luck would be called mirrored.
+    if len(clique) > 2 * max(chance, dimension) and inliers[clique.vertices].mean() < _MIRRORED:
         words = (
             f"{len(clique)} pairs keep their distances, but no motion aligns them: are they mirrored, an axis flipped?"
         )

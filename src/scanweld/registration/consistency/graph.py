@@ -41,6 +41,8 @@ def consistency_graph(
     """
     count = len(source)
     adjacency = np.zeros((count, -(-count // WORD)), np.uint64)
+    if count == 0:
+        return adjacency
     a, b = (_rows(points - points.mean(axis=0)) for points in (source, target))
     n = np.empty((6, 0)) if normals is None else np.concatenate([_rows(side) for side in normals])
     bounds = np.ascontiguousarray(bounds_m)

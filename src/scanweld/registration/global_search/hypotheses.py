@@ -103,6 +103,8 @@ def _consistent_sets(
     source: Scan, target: Scan, i: Int64, j: Int64, scale: bool, views: tuple[DepthMap | None, DepthMap | None]
 ) -> list[Int64]:
     """Return sets of matches that are consistent, of different motions that free space allows, most agreed on first."""
+    if len(i) < _MIN_CLIQUE:
+        return []
     voxel = target.voxel_m
     a, b = source.points[i], target.points[j]
     graph = consistency_graph(
@@ -117,8 +119,7 @@ def _consistent_sets(
         min_length_m=_MIN_LENGTH * voxel,
     )
     sizes, members = np.zeros(len(i), np.int64), np.empty((len(i), _MAX_CLIQUE), np.int64)
-    everyone = np.full(graph.shape[1], ~np.uint64(0))
-    run_ranges(len(i), lambda start, stop: grow_cliques(start, stop, graph, everyone, sizes, members))
+    run_ranges(len(i), lambda start, stop: grow_cliques(start, stop, graph, sizes, members))
     cliques = [members[seed, : sizes[seed]] for seed in np.flatnonzero(sizes >= _MIN_CLIQUE)]
     kind = "least_squares" if scale else "none"
     fits = [fit_pairs(a, b, source_rows=clique, target_rows=clique, scale=kind) for clique in cliques]

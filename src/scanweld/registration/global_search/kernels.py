@@ -5,18 +5,48 @@ from __future__ import annotations
 import numpy as np
 
 from scanweld.parallel import kernel
-from scanweld.registration.consistency.kernels import greedy_clique
+from scanweld.registration.consistency.kernels import ONE, WORD, lowest, ones, test
 
 
 @kernel
-def grow_cliques(start, stop, adjacency, alive, sizes, members):
-    """Grow a clique from each of the vertices start..stop; sizes (N,), and the first members in rows (N, K)."""
-    clique = np.empty(adjacency.shape[0], np.int64)
+def grow_cliques(start, stop, adjacency, sizes, members):
+    """Grow a clique of at most K from each of the vertices start..stop; sizes (N,), members (N, K).
+
+    The neighbours that share the most neighbours with the seed join first (the second-order consistency of Z. Chen et
+    al., "SC2-PCR", CVPR 2022), as long as they are joined with all members.
+    """
+    count, words = adjacency.shape
+    candidates = np.empty(count, np.int64)
+    shared = np.empty(count, np.int64)
     for seed in range(start, stop):
-        size = greedy_clique(adjacency, alive, seed, clique)
-        sizes[seed] = min(size, members.shape[1])
-        for k in range(sizes[seed]):
-            members[seed, k] = clique[k]
+        left = 0
+        for w in range(words):
+            word = adjacency[seed, w]
+            while word != np.uint64(0):
+                v = w * WORD + lowest(word)
+                word &= word - ONE
+                total = 0
+                for k in range(words):
+                    total += ones(adjacency[seed, k] & adjacency[v, k])
+                candidates[left], shared[left] = v, total
+                left += 1
+        size = 1
+        members[seed, 0] = seed
+        while left > 0 and size < members.shape[1]:
+            best = 0
+            for c in range(1, left):
+                if shared[c] > shared[best]:
+                    best = c
+            joining = candidates[best]
+            members[seed, size] = joining
+            size += 1
+            kept = 0
+            for c in range(left):
+                if test(adjacency[joining], candidates[c]):
+                    candidates[kept], shared[kept] = candidates[c], shared[c]
+                    kept += 1
+            left = kept
+        sizes[seed] = size
 
 
 @kernel

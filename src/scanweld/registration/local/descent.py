@@ -34,6 +34,7 @@ _CLEARLY = 1.05  # times the first answer's fit that another must reach
 _SCREENED, _TRY_ITERATIONS = 350, 15  # points and steps that tell a promising start
 _CONFIRMED = 4  # other starts that lead to the first answer again: no need to look further
 _TURNS_DEG = (25.0, 50.0)
+_SHIFTS_GATES = (1.0, 2.5)
 _FARTHEST_RAD = np.deg2rad(75.0)  # from the first guess: a room fits itself after a quarter turn, all of it at once
 
 
@@ -185,10 +186,11 @@ def _starts(problem: Problem, count: int) -> Iterator[Motion]:
     free = [k for k in range(6) if k not in problem.locks]
     axes = np.eye(6)[free]
     moves = [*axes, *-axes]
-    shifts = [problem.gate * move for move in moves if move[:3].any() and np.isfinite(problem.gate)]
+    reach = problem.gate if np.isfinite(problem.gate) else 0.0
+    shifts, far = ([k * reach * move for move in moves if move[:3].any()] for k in _SHIFTS_GATES)
     small, large = ([np.deg2rad(angle) * move for move in moves if move[3:].any()] for angle in _TURNS_DEG)
     both = [(a + b) / np.sqrt(2) for k, a in enumerate(large) for b in large[k + 1 :] if a @ b == 0]
-    for xi in [*small, *shifts, *large, *both][:count]:
+    for xi in [*small, *shifts, *large, *far, *both][:count]:
         T = start.T.copy()
         T[:3, :3] = se3.exp_so3(xi[3:]) @ T[:3, :3]  # the source is centred: it turns about its centre
         T[:3, 3] += xi[:3]
