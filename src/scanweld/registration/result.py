@@ -68,7 +68,7 @@ class RegistrationResult:
         aligner has a noise model, else 0)
     information : (6, 6) in 3-D, (3, 3) in 2-D; Gauss-Newton Hessian of the metric that was minimised, translation [m]
         first, rotation [rad] second, left perturbation at the target's origin
-    covariance : of the estimate, in the order, perturbation and origin of `information`, from the scatter of its scores;
+    covariance : of the estimate, in the order, perturbation and origin of `information`, from its scores;
         free directions have no finite variance: they are zero here and named in `unobservable`. None where the aligner
         makes no claim
     unobservable : directions that the data leaves free; they stay at the initial guess
