@@ -53,9 +53,13 @@ def as_points(points: npt.ArrayLike, name: str = "points", *, dimensions: tuple[
         converted = np.ascontiguousarray(array, dtype=np.float64)
     if isinstance(points, np.ma.MaskedArray) and np.ma.is_masked(points):
         converted = np.where(np.ma.getmaskarray(points), np.nan, converted)
-    if converted.size and LARGEST_COORDINATE < max(float(converted.max()), -float(converted.min())) < np.inf:
-        raise InvalidInputError(f"{name}: a coordinate is beyond {LARGEST_COORDINATE:g}; is a column no coordinate?")
     return converted
+
+
+def refuse_giants(points: Float64, name: str) -> None:
+    """Raise InvalidInputError where a coordinate is finite but too large to be squared."""
+    if points.size and LARGEST_COORDINATE < max(float(points.max()), -float(points.min())) < np.inf:
+        raise InvalidInputError(f"{name}: a coordinate is beyond {LARGEST_COORDINATE:g}; is a column no coordinate?")
 
 
 def _described(points: object, array: Array) -> str:

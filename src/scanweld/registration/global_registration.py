@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from scanweld.arrays import Float64, finite_rows
+from scanweld.arrays import Float64, finite_rows, refuse_giants
 from scanweld.config import check_ranges, setting
 from scanweld.errors import ConfigError, InvalidInputError
 from scanweld.geometry import se3
@@ -181,6 +181,7 @@ def _register(source: Any, target: Any, scale: bool, config: GlobalConfig) -> Re
 def _finite(cloud: Any, name: str) -> tuple[Float64, int]:
     """Return the finite points of a cloud, and the number of others."""
     points = as_cloud(cloud, name).points_m
+    refuse_giants(points, name)
     if points.shape[1] != 3:
         raise InvalidInputError(
             f"{name}: register_global needs points in 3-D, got {points.shape}; use icp() in 2-D, from several T_init"

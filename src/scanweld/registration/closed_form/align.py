@@ -8,7 +8,7 @@ from math import sqrt
 import numpy as np
 import numpy.typing as npt
 
-from scanweld.arrays import Float64, Int64, as_points
+from scanweld.arrays import Float64, Int64, as_points, refuse_giants
 from scanweld.errors import InvalidInputError
 from scanweld.registration.closed_form import kernels as k
 from scanweld.registration.closed_form.fit import METHODS, SCALES, free_planes, solve_pairs
@@ -120,6 +120,8 @@ def pair_residuals(result: RegistrationResult, source: npt.ArrayLike, target: np
     d = len(result.T_target_source) - 1
     a = as_points(source, "source", dimensions=(d,))
     b = as_points(target, "target", dimensions=(d,))
+    refuse_giants(a, "source")
+    refuse_giants(b, "target")
     _check_partners(a, b)
     with np.errstate(invalid="ignore"):  # inf - inf, in a row that is not finite anyway
         moved: Float64 = result.scale * a @ result.T_target_source[:d, :d].T
@@ -133,6 +135,8 @@ def _validated(
     allowed = (shape[1],) if len(shape) == 2 and 2 <= shape[1] <= 64 else (2, 3)
     a = as_points(source, "source", dimensions=allowed)
     b = as_points(target, "target", dimensions=(a.shape[1],))
+    refuse_giants(a, "source")
+    refuse_giants(b, "target")
     _check_partners(a, b)
     kind = scale_kind(scale)
     if method not in METHODS:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from scanweld.arrays import Float64, Int64, as_transform, finite_rows
+from scanweld.arrays import Float64, Int64, as_transform, finite_rows, refuse_giants
 from scanweld.errors import InvalidInputError
 from scanweld.geometry import se3
 from scanweld.geometry.neighbours import KdTree, NeighbourIndex, build_index
@@ -200,6 +200,8 @@ def prepare_problem(
     d = target.dimension
     if source.dimension != d:
         raise InvalidInputError(f"source: expected shape (N, {d}) as the target, got {source.points_m.shape}")
+    refuse_giants(source.points_m, "source")
+    refuse_giants(target.points_m, "target")
     T0 = np.eye(4) if T_init is None else _initial(T_init, d)
     if prior is not None and d == 2:
         raise InvalidInputError("prior: priors are for 3-D points; in 2-D pass T_init and locks")
