@@ -11,7 +11,7 @@ import pytest
 from scanweld.errors import ConfigError, InvalidInputError
 from scanweld.geometry import se3
 from scanweld.geometry.neighbours import build_index
-from scanweld.geometry.normals import estimate_normals
+from scanweld.geometry.normals import estimate_normals, fit_surfaces
 from scanweld.geometry.point_cloud import PointCloud
 from scanweld.registration import residuals
 from scanweld.registration.icp import IcpConfig, icp
@@ -1035,6 +1035,7 @@ class TestUncertainty:
         target = room(1200, 2, 0.005)
         source = back(room(1200, 1, 0.005))
         normals, own = estimate_normals(target), estimate_normals(source)
+        thickness = max(1e-3, float(np.median(fit_surfaces(target).angular_variance)))  # discs as thick as their noise
         config = IcpConfig(method=method, kernel="none", coarse_to_fine=False, attempts=0, tolerance=1e-9,
                            max_iterations=300)  # fmt: skip
         result = icp(source, target, target_normals=normals, source_normals=own, config=config, keep_history=True)
@@ -1053,7 +1054,7 @@ class TestUncertainty:
                 return 0.5 * (d**2).sum()
             if method == "point-to-plane":
                 return 0.5 * ((n * d).sum(axis=1) ** 2).sum()
-            M = residuals.generalised_information(n, m, 1e-3)
+            M = residuals.generalised_information(n, m, thickness)
             return 0.5 * np.einsum("na,nab,nb->", d, M, d)
 
         h = 1e-4

@@ -182,6 +182,46 @@ def test_nearest_into_fills_its_range_only():
         assert (squared[:10] == 7).all()
 
 
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("kind", ["gauss", "lattice", "duplicates", "uneven"])
+def test_followed_queries_get_the_partners_of_a_fresh_search(kind, dimension):
+    """Queries that move by ever smaller steps, across the gate and back, from cell to cell: the same bytes."""
+    points = cloud(kind, 3000, dimension, 0)
+    queries = np.concatenate([queries_around(points, seed) for seed in range(8)])
+    grid, rng, gate = HashGrid(points), np.random.default_rng(2), 0.3 * points.std(axis=0).min()
+    partners, squared = np.full(len(queries), -1, np.int32), np.zeros(len(queries))
+    anchors = np.zeros((len(queries), 4))
+    for step in 0.3 * gate * 0.7 ** np.arange(25):
+        queries = queries + step * rng.normal(size=queries.shape)
+        grid.follow_into(queries, 0, len(queries), gate, partners, squared, anchors, 0.1 * gate)
+        fresh, apart = np.full(len(queries), -1, np.int32), np.zeros(len(queries))
+        grid.nearest_into(queries, 0, len(queries), gate, fresh, apart)
+        assert partners.tobytes() == fresh.tobytes()
+        assert squared.tobytes() == apart.tobytes()
+
+
+def test_followed_queries_are_not_searched_for_again():
+    """A query keeps its anchor while it moves less than its margin, half the lead over the second nearest point."""
+    grid, query = HashGrid(np.array([[0.0, 0, 0], [1, 0, 0], [5, 5, 5]])), np.array([[0.2, 0, 0]])
+    partners, squared, anchors = np.full(1, -1, np.int32), np.zeros(1), np.zeros((1, 4))
+    grid.follow_into(query, 0, 1, 2.0, partners, squared, anchors, 10.0)
+    np.testing.assert_allclose(anchors, [[0.2, 0, 0, 0.3]], rtol=1e-6)  # (0.8 - 0.2) / 2
+    for x, anchor in ((0.45, 0.2), (0.55, 0.55)):
+        grid.follow_into(np.array([[x, 0, 0]]), 0, 1, 2.0, partners, squared, anchors, 10.0)
+        assert (partners[0], anchors[0, 0]) == (round(x), anchor)
+        assert squared[0] == pytest.approx((x - round(x)) ** 2)
+
+
+def test_sparse_places_are_fitted_like_the_others():
+    """A dense floor, and so many points far apart that a coarser grid serves them."""
+    rng = np.random.default_rng(0)
+    floor = rng.uniform(-5, 5, (6000, 3)) * [1, 1, 0.01]
+    points = np.concatenate([floor, rng.uniform(-200, 200, (300, 3))])
+    grid, tree = (fit_surfaces(points, neighbours=12, index=kind(points)) for kind in INDICES)
+    np.testing.assert_allclose(np.abs(np.einsum("nd,nd->n", grid.normals, tree.normals)), 1, atol=1e-9)
+    np.testing.assert_allclose(grid.angular_variance, tree.angular_variance, rtol=1e-9)
+
+
 def test_threads_do_not_change_a_byte():
     points = np.concatenate([cloud("flat", 20_000, 3, 0), cloud("uneven", 300, 3, 1)])
     queries = queries_around(points, 1)

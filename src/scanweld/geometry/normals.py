@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -12,7 +13,12 @@ from scanweld.arrays import Float64, as_points
 from scanweld.errors import InvalidInputError
 from scanweld.geometry.neighbours.kd_tree import KdTree, NeighbourIndex, build_index
 
+if TYPE_CHECKING:
+    from scanweld.geometry.neighbours.grid import HashGrid
+
 NEIGHBOURS = 20
+_SPARSE = 1 / 256  # of the points, queries in sparse places; more of them are worth a grid of their own
+_COARSER = 4.0  # times the cells of the first grid
 _LISTED = 8192  # rows at a time: k neighbours of a million points at once would take 480 MB
 
 
@@ -126,7 +132,7 @@ def _fit(index: NeighbourIndex, at: Float64 | None, k: int, num_threads: int | N
     """Normals and ascending eigenvalues (M, D) of the covariance of the k points nearest to each place."""
     from scanweld.geometry.neighbours.grid import HashGrid, embedded  # loads Numba
     from scanweld.geometry.surfaces import kernels
-    from scanweld.parallel import limited_threads, run_ranges
+    from scanweld.parallel import limited_threads
 
     points = index.points
     dimension = points.shape[1]
@@ -138,14 +144,15 @@ def _fit(index: NeighbourIndex, at: Float64 | None, k: int, num_threads: int | N
             grid = index.suited_to(k)
             queries = grid.rows if at is None else grid.arranged(at)
 
-            def fit(first: int, last: int) -> None:
-                start, stop = first * kernels.CHUNK, min(last * kernels.CHUNK, count)
-                kernels.fit_nearest(
-                    queries, start, stop, k, dimension, grid.rows, grid.starts, grid.lattice, normals, values
-                )
-
-            run_ranges(-(-count // kernels.CHUNK), fit)
+            _fit_on(grid, queries, k, False, normals, values)
             rest = np.flatnonzero(values[:, 0] < 0)
+            if len(rest) > len(points) * _SPARSE:
+                grid = HashGrid(points, cell_m=_COARSER * grid.cell_m)
+            if len(rest):
+                queries = grid.arranged((points if at is None else at)[rest])
+                queries[:, 3] = rest[queries[:, 3].astype(np.int64)]
+                _fit_on(grid, queries, k, True, normals, values)
+                rest = rest[values[rest, 0] < 0]
             if len(rest):
                 index = index.tree
         space = embedded(points)
@@ -155,3 +162,17 @@ def _fit(index: NeighbourIndex, at: Float64 | None, k: int, num_threads: int | N
             _, near = index.k_nearest(places, k)
             kernels.fit_listed(embedded(places), near, space, dimension, rows, normals, values)
     return normals, values
+
+
+def _fit_on(grid: HashGrid, queries: Float64, k: int, patient: bool, normals: Float64, values: Float64) -> None:
+    """Fit the neighbourhoods of queries (N, 4) into the rows that they name."""
+    from scanweld.geometry.surfaces import kernels
+    from scanweld.parallel import run_ranges
+
+    def fit(first: int, last: int) -> None:
+        start, stop = first * kernels.CHUNK, min(last * kernels.CHUNK, len(queries))
+        kernels.fit_nearest(
+            queries, start, stop, k, normals.shape[1], grid.rows, grid.starts, grid.lattice, patient, normals, values
+        )
+
+    run_ranges(-(-len(queries) // kernels.CHUNK), fit)

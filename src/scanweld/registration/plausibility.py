@@ -22,7 +22,7 @@ import numpy as np
 
 from scanweld.arrays import Float64
 from scanweld.geometry.neighbours import NeighbourIndex
-from scanweld.geometry.normals import fit_surfaces, flatness
+from scanweld.geometry.normals import SurfaceFit, fit_surfaces, flatness
 
 COINCIDENT = 0.1
 """Pairs closer than this share of the spacing are the same points."""
@@ -89,22 +89,27 @@ def gather_evidence(
     reach_m: float,
     neighbours: int,
     surfaces: bool,
+    fit: SurfaceFit | None = None,
 ) -> Evidence:
     """Pair a sample of the moved source points (N, D) and look at the target around their partners.
 
     At least one point must have a partner within the reach. `surfaces`: see :func:`has_surfaces`.
+    `fit`: that of the whole target, where it is there.
     """
     distances, partner = index.nearest(moved, reach_m)
     near = np.flatnonzero(np.isfinite(distances))
     near = near[:: max(1, len(near) // SAMPLE)]
     partners = target[partner[near]]
-    surface = fit_surfaces(target, at=partners, index=index, neighbours=neighbours)
+    if fit is None:
+        fit = fit_surfaces(target, at=partners, index=index, neighbours=neighbours)
+    else:
+        fit = SurfaceFit(fit.normals[partner[near]], fit.angular_variance[partner[near]])
     return Evidence(
         moved=moved[near],
         partners=partners,
         distances_m=distances[near],
-        normals=surface.normals,
-        normal_variance=float(np.median(surface.angular_variance)),
+        normals=fit.normals,
+        normal_variance=float(np.median(fit.angular_variance)),
         surfaces=surfaces,
         spacing_m=spacing_m,
         reach_m=reach_m,

@@ -20,6 +20,7 @@ OCCUPANCY = 8.0
 
 _OCCUPANCY_PER_NEIGHBOUR = 0.7  # the same where k neighbours are looked for in the cells around
 _TRIALS = 8
+_GRAIN = 2048  # queries that are worth a thread
 _CELLS = 2.0**30  # along an axis: a cell's number is an int32 with room to spare
 _HUGE = 1e300  # stands for no bound; kernels know no infinity
 
@@ -95,9 +96,28 @@ class HashGrid:
         self, points: Float64, start: int, stop: int, max_distance: float, partners: Int32, squared: Float64
     ) -> None:
         """See :class:`~scanweld.geometry.neighbours.NeighbourIndex`."""
+        self.follow_into(points, start, stop, max_distance, partners, squared, np.empty((0, 4)), 0.0)
+
+    def follow_into(
+        self,
+        points: Float64,
+        start: int,
+        stop: int,
+        max_distance: float,
+        partners: Int32,
+        squared: Float64,
+        anchors: Float64,
+        slack_m: float,
+    ) -> None:
+        """Find the nearest points as :meth:`nearest_into`, of queries that move little from one call to the next.
+
+        anchors : (N, 4), zero before the first call and then the caller's to keep, with `partners`, while the distance
+            stays the same: where each query was searched for, and how far from there its partner cannot change
+        slack_m : about how far the queries will move; each search looks so much further
+        """
         if points.shape[1] == 2:
             rows = slice(start, stop)
-            queries, own, distances = embedded(points[rows]), partners[rows], squared[rows]
+            queries, own, distances, anchors = embedded(points[rows]), partners[rows], squared[rows], anchors[rows]
             start, stop = 0, len(queries)
         else:
             queries, own, distances = points, partners, squared
@@ -112,6 +132,8 @@ class HashGrid:
             _inclusive_square(max_distance),
             own,
             distances,
+            slack_m,
+            anchors,
         )
         if unresolved:
             far = start + np.flatnonzero(own[start:stop] == kernels.UNRESOLVED)
@@ -192,7 +214,7 @@ class HashGrid:
 
     def _run(self, count: int, body: Callable[[int, int], object]) -> None:
         with limited_threads(self._num_threads):
-            run_ranges(count, body)
+            run_ranges(count, body, grain=_GRAIN)
 
     def _settle(self, cell_m: float | None, occupancy: float) -> None:
         """Choose the side of a cell and count the points of each."""

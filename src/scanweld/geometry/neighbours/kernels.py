@@ -114,15 +114,29 @@ def place(points, buckets, starts, rows):
 
 
 @inlined
-def nearest_of_run(x, y, z, begin, end, rows, bound, best):
-    """Nearest of rows begin..end within `bound` (squared, inclusive), the lowest original row among equals."""
+def nearest_of_run(x, y, z, begin, end, rows, slack, bound, best, least, second):
+    """Nearest of rows begin..end, the lowest original row among equals, and the distance of the second.
+
+    All squared: `bound`, inclusive, how far to look; `least` and `second`, the distances of the row `best` and of the
+    next one. The bound is that of `best` widened by `slack` (m).
+    """
     for n in range(begin, end):
         d = squared_distance(x, y, z, rows[n])
         if d <= bound:
             row = np.int64(rows[n, 3])
-            if (d < bound) | (best < 0) | (row < best):
-                bound, best = d, row
-    return bound, best
+            if (d < least) | (best < 0) | ((d == least) & (row < best)):
+                least, second, best = d, least, row
+                bound = min(bound, second, widened(d, slack))
+            elif (d < second) & (row != best):
+                second = d
+                bound = min(bound, second)
+    return bound, best, least, second
+
+
+@inlined
+def widened(square, slack):
+    """Square of a distance, given squared, that has become longer by `slack`."""
+    return square + slack * (2.0 * math.sqrt(square) + slack)
 
 
 @inlined
@@ -137,11 +151,11 @@ def ring_distance(u, cell, ring, cells):
 
 
 @kernel
-def nearest_close_by(x, y, z, ux, uy, uz, reach, per_m, rows, starts, lattice, bound, best):
+def nearest_close_by(x, y, z, ux, uy, uz, reach, per_m, rows, starts, lattice, slack, bound, best, least, second):
     """Search the few rows within a short reach, in order."""
     columns, lines, layers = lattice[4], lattice[5], lattice[6]
     if (ux + reach < 0) | (ux - reach >= columns):
-        return bound, best
+        return bound, best, least, second
     first, last = clamped_cell(ux - reach, columns), clamped_cell(ux + reach, columns)
     for j in range(clamped_cell(uy - reach, lines), clamped_cell(uy + reach, lines) + 1):
         dy = beyond(uy, j)
@@ -149,15 +163,17 @@ def nearest_close_by(x, y, z, ux, uy, uz, reach, per_m, rows, starts, lattice, b
             dz = beyond(uz, k)
             if dy * dy + dz * dz <= reach * reach:
                 h = row_bucket(j, k, lattice[7])
-                closer, best = nearest_of_run(x, y, z, starts[h + first], starts[h + last + 1], rows, bound, best)
+                closer, best, least, second = nearest_of_run(
+                    x, y, z, starts[h + first], starts[h + last + 1], rows, slack, bound, best, least, second
+                )
                 if closer < bound:
                     bound = closer
                     reach = math.sqrt(bound) * per_m + SLACK
-    return bound, best
+    return bound, best, least, second
 
 
 @kernel
-def nearest_in_rings(x, y, z, ux, uy, uz, reach, per_m, rows, starts, lattice, bound, best):
+def nearest_in_rings(x, y, z, ux, uy, uz, reach, per_m, rows, starts, lattice, slack, bound, best, least, second):
     """Search rows in square rings around the query's own, only as far as the best so far."""
     columns, lines, layers = lattice[4], lattice[5], lattice[6]
     j, k = clamped_cell(uy, lines), clamped_cell(uz, layers)
@@ -179,33 +195,44 @@ def nearest_in_rings(x, y, z, ux, uy, uz, reach, per_m, rows, starts, lattice, b
                     continue
                 first, last = clamped_cell(ux - along, columns), clamped_cell(ux + along, columns)
                 h = row_bucket(j + dj, k + dk, lattice[7])
-                closer, best = nearest_of_run(x, y, z, starts[h + first], starts[h + last + 1], rows, bound, best)
+                closer, best, least, second = nearest_of_run(
+                    x, y, z, starts[h + first], starts[h + last + 1], rows, slack, bound, best, least, second
+                )
                 if closer < bound:
                     bound = closer
                     reach = min(math.sqrt(bound) * per_m + SLACK, RINGS + 0.0)
-    return bound, best
+    return bound, best, least, second
 
 
 @kernel
-def nearest(points, start, stop, rows, starts, lattice, originals, gate, partners, squared):
+def nearest(points, start, stop, rows, starts, lattice, originals, gate, partners, squared, slack, anchors):
     """Fill the partner and the squared distance of queries start..stop (N, 3).
 
     gate: squared, inclusive. partners int32, in: a row of `originals` (M, 3) to start from, or -1; out: the nearest
     row, -1 where none is near enough, UNRESOLVED where the grid gave up. Returns how many are unresolved.
+
+    anchors (N, 4), or (0, 4) to do without: where a query was when it was last searched for, and how far from there it
+    may be before it can have another partner, which is what the search looks for `slack` (m) beyond the nearest.
 
     Rows of cells are searched in square rings around the query's own, and only as far as the best so far.
     """
     unresolved = 0
     per_m = lattice[3]
     columns, lines, layers = lattice[4], lattice[5], lattice[6]
+    follows = len(anchors) > 0
+    slack = slack if follows else 0.0
+    furthest = widened(gate, slack)
     for n in range(start, stop):
         x, y, z = points[n, 0], points[n, 1], points[n, 2]
-        bound, best = gate, np.int64(-1)
+        bound, best, least, second = furthest, np.int64(-1), furthest, furthest
         hint = np.int64(partners[n])
-        if hint >= 0:
-            d = squared_distance(x, y, z, originals[hint])
-            if d <= gate:
-                bound, best = d, hint
+        d = squared_distance(x, y, z, originals[hint]) if hint >= 0 else 0.0
+        if follows and d <= gate and squared_distance(x, y, z, anchors[n]) < anchors[n, 3] * anchors[n, 3]:
+            squared[n] = d
+            continue
+        if hint >= 0 and d <= furthest:
+            best, least = hint, d
+            bound = min(furthest, widened(d, slack))
         ux = cell_coordinate(x, lattice[0], per_m)
         uy = cell_coordinate(y, lattice[1], per_m)
         uz = cell_coordinate(z, lattice[2], per_m)
@@ -213,14 +240,25 @@ def nearest(points, start, stop, rows, starts, lattice, originals, gate, partner
         if best < 0:  # the cells at hand give a first bound
             h = row_bucket(j, k, lattice[7])
             begin, end = starts[h + max(i - 1, 0)], starts[h + min(i + 1, np.int64(columns) - 1) + 1]
-            bound, best = nearest_of_run(x, y, z, begin, end, rows, bound, best)
+            bound, best, least, second = nearest_of_run(x, y, z, begin, end, rows, slack, bound, best, least, second)
         reach = min(math.sqrt(bound) * per_m + SLACK, RINGS + 0.0)
         if reach <= NEAR:
-            bound, best = nearest_close_by(x, y, z, ux, uy, uz, reach, per_m, rows, starts, lattice, bound, best)
+            bound, best, least, second = nearest_close_by(
+                x, y, z, ux, uy, uz, reach, per_m, rows, starts, lattice, slack, bound, best, least, second
+            )
         else:
-            bound, best = nearest_in_rings(x, y, z, ux, uy, uz, reach, per_m, rows, starts, lattice, bound, best)
-        proven = math.sqrt(bound) * per_m + SLACK <= RINGS  # the gate, where nothing was found; a far hint is no proof
+            bound, best, least, second = nearest_in_rings(
+                x, y, z, ux, uy, uz, reach, per_m, rows, starts, lattice, slack, bound, best, least, second
+            )
+        # the gate, where nothing was found; a far hint is no proof
+        proven = math.sqrt(min(least, gate)) * per_m + SLACK <= RINGS
         unresolved += 0 if proven else 1
-        partners[n] = best if proven else UNRESOLVED
-        squared[n] = bound if proven and best >= 0 else 0.0
+        found = (best >= 0) & (least <= gate)
+        partners[n] = (best if found else -1) if proven else UNRESOLVED
+        squared[n] = least if proven and found else 0.0
+        if follows:
+            seen = min(math.sqrt(bound), (RINGS - SLACK) / per_m)  # no other point is nearer
+            margin = 0.5 * (seen - math.sqrt(least)) if found else min(seen, math.sqrt(least)) - math.sqrt(gate)
+            anchors[n, 0], anchors[n, 1], anchors[n, 2] = x, y, z
+            anchors[n, 3] = max(margin - 1e-9 * seen, 0.0) if proven else 0.0
     return unresolved

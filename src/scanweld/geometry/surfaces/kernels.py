@@ -14,7 +14,7 @@ from scanweld.geometry.neighbours.kernels import UNRESOLVED
 from scanweld.geometry.neighbours.many.kernels import BLOCK, BLOCK_RINGS, k_in_ball, k_in_block, working_space
 from scanweld.parallel import inlined, kernel
 
-CHUNK = 2048
+CHUNK = 512
 """Queries after which the search starts afresh: sums are formed in the same order at any number of threads."""
 
 COLLINEAR = 1e-8
@@ -123,10 +123,11 @@ def write_fit(row, covariance, dimension, normals, values):
 
 
 @kernel
-def fit_nearest(queries, start, stop, k, dimension, rows, starts, lattice, normals, values):
+def fit_nearest(queries, start, stop, k, dimension, rows, starts, lattice, patient, normals, values):
     """Fit the k nearest points of each query (N, 4) in start..stop, whose result belongs to row query[3].
 
-    normals, values (N, dimension); values[row, 0] is UNRESOLVED where the grid gave up. Returns how many.
+    normals, values (N, dimension); values[row, 0] is UNRESOLVED where the grid gave up, which it does sooner unless
+    `patient`: a coarser one is faster there. Returns how many.
     """
     work = working_space()
     chosen, squares = np.empty(BLOCK, np.int64), np.empty(BLOCK)
@@ -138,7 +139,7 @@ def fit_nearest(queries, start, stop, k, dimension, rows, starts, lattice, norma
         x, y, z = queries[n, 0], queries[n, 1], queries[n, 2]
         row = np.int64(queries[n, 3])
         found = k_in_block(x, y, z, k, 1e300, rows, starts, lattice, work, chosen)
-        if found <= 0:
+        if found == 0 or (found < 0 and patient):
             cells = 1.0 if found == 0 else BLOCK_RINGS + 0.5
             found, chosen, squares = k_in_ball(x, y, z, k, 1e300, cells, rows, starts, lattice, chosen, squares)
         if found < 0:

@@ -30,7 +30,7 @@ from scanweld.registration.local.problem import Motion, Problem
 from scanweld.registration.residuals import point_jacobian
 from scanweld.registration.robust import CompiledWeight, mad_scale
 
-_CLUSTERS = 10_000  # targets whose scores stand for all
+_CLUSTERS = 3_000  # targets whose scores stand for all
 _MOVED = 512  # source points whose change of scores stands for all
 _STEP = 0.5  # standard deviations of the residuals: small enough to be a slope, large enough to change partners
 _LEAST_STEP = 0.01  # spacings, where there is no noise

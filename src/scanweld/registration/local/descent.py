@@ -22,7 +22,7 @@ from scanweld.registration.robust import GraduatedNonConvexity, RobustKernel
 _COARSE_FROM = 500  # points of the source; fewer are all looked at from the beginning
 _COARSEST = 1000  # points of the source that find the valley
 _LEVEL_RATIO = 8  # a level has so many times the points of the one before
-_SETTLED_COARSE, _SETTLED_FINE = 0.5, 0.1  # a step of so many standard deviations of the estimate moves nothing
+_SETTLED_COARSE, _SETTLED_FINE = 0.5, 0.25  # a step of so many standard deviations of the estimate moves nothing
 _CYCLE_SPACINGS = 0.1  # pairs that flip to and fro may keep the motion swaying by so much; that is an answer
 _PROBES = 500  # points whose displacement stands for all
 _MUCH_TIGHTER = 0.7  # of the gate: reason enough to step on with a tighter one
@@ -96,7 +96,7 @@ def iterate(
     """Pair and step until a step is small, or below `settled` standard deviations of what the points can tell."""
     pairs, kernels = Pairing(problem, config), _Kernels(config)
     ahead = Anderson(motion, config.anderson)
-    probes = problem.source[:: max(1, len(problem.source) // _PROBES)]
+    probes = moments(problem.source)
     last = np.inf
     landmark, sway = motion, np.inf  # to notice a cycle: where the motion was, and how far it moved since (Brent 1980)
     for count in range(1, config.max_iterations + 1):
@@ -126,23 +126,31 @@ def iterate(
     return Descent(problem, motion, pairs, config.max_iterations, False)
 
 
-def distance(points: Float64, one: Motion, other: Motion) -> float:
-    """Root mean square distance between the places where two motions put the points."""
-    return float(np.sqrt(((one.apply(points) - other.apply(points)) ** 2).sum(axis=1).mean()))
+def moments(points: Float64) -> Float64:
+    """Return the mean of (x, 1) (x, 1)^T (4, 4) over some of the points (N, 3)."""
+    some = points[:: max(1, len(points) // _PROBES)]
+    some = np.column_stack([some, np.ones(len(some))])
+    return np.asarray(some.T @ some / len(some))
+
+
+def distance(probes: Float64, one: Motion, other: Motion) -> float:
+    """Root mean square distance between the places where two motions put points with these :func:`moments`."""
+    difference = one.matrix - other.matrix
+    return float(np.sqrt(max(float(np.vdot(difference @ probes, difference)), 0.0)))
 
 
 def _best_attempt(problem: Problem, config: IcpConfig, end: Descent) -> Descent:
     """Try other starts around the first guess when the first one led to where the surfaces do not meet.
 
     A right answer has its pairs either close together or not at all, beyond the rim; in a wrong minimum many are a good
-    way apart. The closest fit wins, and only a clearly closer one replaces the first.
+    way apart. The closest fit wins, and only a clearly closer one replaces the first, or one whose surfaces meet.
     """
     closeness, score = _fit(problem, end)
     if closeness >= _FITS:
         return end
     few = problem.coarse(max(1, len(problem.source) // _SCREENED), config.neighbours)
     short = replace(config, max_iterations=_TRY_ITERATIONS)
-    probes, confirmed = few.source[:: max(1, len(few.source) // _PROBES)], 0
+    probes, confirmed = moments(few.source), 0
     count, best = end.count, (_fit(few, replace(end, problem=few, pairs=Pairing(few, config)))[1], end.motion)
     for start in _starts(problem, config.attempts):
         attempt = iterate(few, short, start, _SETTLED_COARSE)
@@ -159,7 +167,8 @@ def _best_attempt(problem: Problem, config: IcpConfig, end: Descent) -> Descent:
     if best[1] is not end.motion:
         attempt = iterate(problem, config, best[1], _SETTLED_COARSE)
         count += attempt.count
-        end = attempt if _fit(problem, attempt)[1] > _CLEARLY * score else end
+        closeness, other = _fit(problem, attempt)
+        end = attempt if other > (_CLEARLY if closeness < _FITS else 1 / _CLEARLY) * score else end
     return replace(end, count=count)
 
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from scanweld.arrays import Float64, Int64
 from scanweld.geometry import se3
+from scanweld.geometry.normals import SurfaceFit
 from scanweld.registration.closed_form import RANK_TOLERANCE
 from scanweld.registration.gauss_newton import NormalEquations, Spectrum, free_directions, moved_origin, solve
 from scanweld.registration.local import kernels
@@ -131,10 +132,13 @@ def judge(end: Descent, config: IcpConfig) -> RegistrationResult:
 def gather(problem: Problem, motion: Motion, pairs: Pairing, neighbours: int) -> Evidence:
     """Collect what tells a fit from chance, from some of the source's points, those that have a partner among them."""
     found = np.flatnonzero(pairs.partner >= 0)
-    few = len(found) < SAMPLE
-    rows = np.arange(0, len(problem.source), 1 if few else max(1, len(problem.source) // (4 * SAMPLE)))
-    if not few and not (pairs.partner[rows] >= 0).any():
+    total = len(problem.source)
+    count = total if total < 4 * SAMPLE else min(total, SAMPLE * total // len(found))
+    # Evenly spread, but at no whole stride, which might be that of the data.
+    rows = np.linspace(0, total - 1, count).astype(np.int64)
+    if not (pairs.partner[rows] >= 0).any():
         rows = found
+    known = len(problem.angular_variance) > 0
     return gather_evidence(
         problem.in_dimension(motion.apply(problem.source[rows])),
         problem.in_dimension(problem.target),
@@ -143,6 +147,7 @@ def gather(problem: Problem, motion: Motion, pairs: Pairing, neighbours: int) ->
         max(problem.gate, SPACINGS_PER_GATE * problem.spacing),
         neighbours,
         problem.surfaces,
+        SurfaceFit(problem.in_dimension(problem.normals), problem.angular_variance) if known else None,
     )
 
 

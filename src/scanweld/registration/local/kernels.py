@@ -15,7 +15,10 @@ from scanweld.registration.robust.kernels import robust_weight
 BLOCK = 256
 """Pairs handled at a time: their rows stay in the first-level cache."""
 
-CHUNK = 4096
+COLUMN = BLOCK + 8
+"""Length of a column of rows: at a power of two, all columns would compete for the same few places of the cache."""
+
+CHUNK = 1024
 """Points whose sums share one row of partial sums; fixed, so that sums do not depend on the threads."""
 
 PRODUCTS = 36
@@ -193,7 +196,7 @@ def pair_sums(metric, start, stop, moved, partner, point_weights, target, normal
     Colour rows are weighted to be in units of the geometric residual's noise, so that H has the unit of the geometric
     rows.
     """
-    rows = np.empty((3, 8, BLOCK))
+    rows = np.empty((3, 8, COLUMN))
     squares = np.empty((2, BLOCK))
     picks = np.empty(BLOCK, np.int64)
     weights = np.empty(BLOCK)
@@ -242,9 +245,9 @@ def add_scores(metric, stride, moved, partner, point_weights, target, normals, s
     `stride` > 0: the row is that of the target, row j / stride for every `stride`-th target j, as sources that share a
     target share its error; 0: each pair has the row of its source. bread (7, 7).
     """
-    rows = np.empty((3, 8, BLOCK))
-    squares = np.empty((2, BLOCK))
-    picks = np.empty(BLOCK, np.int64)
+    rows = np.empty((3, 8, 1))
+    squares = np.empty((2, 1))
+    picks = np.empty(1, np.int64)
     components = 3 if metric == POINT or metric == GENERALISED else 1
     balance = (noise[0] / noise[1]) ** 2
     code = np.int64(robust[0])
@@ -277,7 +280,7 @@ def add_scores(metric, stride, moved, partner, point_weights, target, normals, s
 @kernel
 def pair_squares(metric, stride, moved, partner, target, normals, source_normals, rotation, colour, thickness, out):
     """Squared residuals (2, K), geometric and of colour, of every `stride`-th point's pair; returns how many."""
-    rows = np.empty((3, 8, BLOCK))
+    rows = np.empty((3, 8, COLUMN))
     squares = np.zeros((2, BLOCK))
     picks = np.empty(BLOCK, np.int64)
     count = 0

@@ -25,6 +25,8 @@ METRICS = {
 LEAST_NOISE = 0.02  # spacings: on noise-free planes the median is 0, and all that is curved would be an outlier
 _LEAST_BESIDE_COLOUR = 0.1  # spacings; more trust in a noise-free surface would leave texture no say along it
 _LEAST_COLOUR_NOISE = 0.01  # of the range of intensities; images have 256 steps
+_GRAIN = 6  # chunks that are worth a thread
+_UPPER = np.triu_indices(8)
 _SAMPLE = 2048  # residuals whose median stands for all
 
 
@@ -63,13 +65,14 @@ def estimate_noise(
     problem: Problem, metric: int, pairs: Pairing, motion: Motion, known_m: float = 0.0
 ) -> tuple[Noise, Float64]:
     """Return the noise from the median of a sample of residuals, and that sample [m]."""
+    coloured = metric == kernels.COLOURED
     stride = max(1, len(pairs.partner) // _SAMPLE)
     squares = np.zeros((2, len(pairs.partner) // stride + 1))
     count = kernels.pair_squares(metric, stride, *_arguments(problem, pairs, motion), squares)
     residuals = np.sqrt(squares[:, :count])
-    least = (_LEAST_BESIDE_COLOUR if metric == kernels.COLOURED else LEAST_NOISE) * problem.spacing
+    least = (_LEAST_BESIDE_COLOUR if coloured else LEAST_NOISE) * problem.spacing
     geometric = known_m or max(mad_scale(residuals[0]), least, 1e-300)
-    colour = max(mad_scale(residuals[1]), _LEAST_COLOUR_NOISE)
+    colour = max(mad_scale(residuals[1]), _LEAST_COLOUR_NOISE) if coloured else _LEAST_COLOUR_NOISE
     return Noise(geometric, colour), residuals[0]
 
 
@@ -88,11 +91,10 @@ def linearise(
             metric, start, stop, moved, partner, problem.weights, target, *rest, deviations, robust, partials
         )
 
-    run_ranges(chunks, body)
+    run_ranges(chunks, body, grain=_GRAIN)
     sums = partials.sum(axis=0)
     full = np.zeros((8, 8))
-    full[np.triu_indices(8)] = sums[: kernels.PRODUCTS]
-    full += np.triu(full, 1).T
+    full[_UPPER] = full.T[_UPPER] = sums[: kernels.PRODUCTS]
     return _assemble(metric, problem.dimension, full, sums[kernels.PRODUCTS :])
 
 
@@ -100,9 +102,9 @@ def _assemble(metric: int, dimension: int, full: Float64, moments: Float64) -> L
     weight = float(moments[0])
     centroid = moments[1:4] / weight if weight > 0 else np.zeros(3)
     spread = moments[4] / weight - centroid @ centroid if weight > 0 else 0.0
-    twist = PLANE if dimension == 2 else np.arange(6)
+    twist = PLANE if dimension == 2 else slice(6)
     equations = NormalEquations(
-        information=full[np.ix_(twist, twist)],
+        information=full[twist][:, twist],
         gradient=full[twist, 7],
         # Slopes are compared with those of rows of unit length; GICP's shrink where the normals disagree.
         total_weight=float(np.trace(full[:dimension, :dimension])) / (dimension if metric == kernels.POINT else 1),

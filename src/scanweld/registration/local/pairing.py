@@ -8,13 +8,15 @@ import numpy as np
 
 from scanweld.arrays import Bool, Float64, Int32
 from scanweld.geometry.neighbours import NeighbourIndex, build_index
+from scanweld.geometry.neighbours.grid import HashGrid
 from scanweld.parallel import run_ranges
 from scanweld.registration.local import kernels
 from scanweld.registration.local.config import IcpConfig
 from scanweld.registration.local.problem import Motion, Problem, neighbours_of
 
 _CHUNK = 4096
-_GRAIN = 1500  # points that are worth a thread
+_GRAIN, _FOLLOWED_GRAIN = 1500, 8000  # points that are worth a thread; most that are followed keep their partner
+_SLACK = 0.2  # spacings that steps move points near the end; partners that cannot change so soon are not sought again
 _RIM_GAP_RAD = np.pi / 2  # neighbours that leave so wide a gap around a point: it is on the rim
 
 
@@ -34,6 +36,8 @@ class Pairing:
         self.partner: Int32 = np.full(count, -1, np.int32)
         self.squared: Float64 = np.full(count, np.inf)
         self._hint: Int32 = np.full(count, -1, np.int32)
+        self._anchors: Float64 = np.zeros((count, 4))
+        self._followed = False
         self._problem = problem
         self._rejections = _rejections(problem, config)
 
@@ -44,9 +48,15 @@ class Pairing:
         def body(start: int, stop: int) -> None:
             kernels.move_points(start, stop, problem.source, matrix, self.moved)
             places = self.moved if problem.dimension == 3 else problem.in_dimension(self.moved)
-            problem.index.nearest_into(places, start, stop, problem.gate, self._hint, self.squared)
+            if isinstance(problem.index, HashGrid):
+                problem.index.follow_into(
+                    places, start, stop, problem.gate, self._hint, self.squared, self._anchors, _SLACK * problem.spacing
+                )
+            else:
+                problem.index.nearest_into(places, start, stop, problem.gate, self._hint, self.squared)
 
-        run_ranges(len(self.moved), body, grain=_GRAIN)
+        run_ranges(len(self.moved), body, grain=_FOLLOWED_GRAIN if self._followed else _GRAIN)
+        self._followed = isinstance(problem.index, HashGrid)
         if not self._rejections:
             self.partner = self._hint
         else:

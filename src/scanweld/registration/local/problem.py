@@ -5,7 +5,9 @@ Inside, everything is three-dimensional: a problem of the plane has z = 0, and i
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -16,6 +18,7 @@ from scanweld.geometry import se3
 from scanweld.geometry.neighbours import KdTree, NeighbourIndex, build_index
 from scanweld.geometry.normals import fit_surfaces
 from scanweld.geometry.point_cloud import PointCloud, grid_order, median_spacing, voxel_downsample_each
+from scanweld.parallel import get_num_threads, limited_threads, run_ranges
 from scanweld.registration.gauss_newton import NormalEquations, free_directions, moved_origin, spectrum
 from scanweld.registration.local.colour import intensity, intensity_gradients
 from scanweld.registration.local.config import IcpConfig
@@ -29,16 +32,18 @@ RADII_PER_GATE = 0.1
 distances from their centre: scans from one place are far denser near the sensor than what must be reached."""
 
 THICKNESS = 1e-3
-"""Variance across a disc over that along it: how far GICP trusts the surfaces (Segal et al. 2009, section III.B)."""
+"""Least variance across a disc over that along it: how far GICP trusts surfaces (Segal et al. 2009, section III.B)."""
 
 _COARSE_THICKNESS = 1e-2  # far from the answer the surfaces are trusted less: the leash along them pulls more
 _SORTED_FROM = 4096  # points; a smaller cloud fits into the cache in any order
 _NORMAL_SAMPLE = 1000
-_SURFACE_SAMPLE = 300
+_SURFACE_SAMPLE = 150
 PLANE = np.array([0, 1, 5])
 """The entries of a twist of space (x, y, z, rx, ry, rz) that move a plane z = 0 within itself."""
 
 _OUT_OF_PLANE = (2, 3, 4)
+_One = TypeVar("_One")
+_Other = TypeVar("_Other")
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,6 +98,7 @@ class Problem:
     prior : between the centred clouds, or None
     dropped : what was dropped, in words
     thickness : of GICP's discs
+    angular_variance : (M,) of each normal [rad^2]; (0,) where the normals were given
     """
 
     dimension: int
@@ -115,7 +121,8 @@ class Problem:
     locks: tuple[int, ...]
     prior: MotionPrior | None
     dropped: str
-    thickness: float = THICKNESS
+    thickness: float
+    angular_variance: Float64
 
     @property
     def uneven(self) -> bool:
@@ -171,7 +178,7 @@ class Problem:
             source_normals=source_normals,
             weights=np.ascontiguousarray(self.weights[part]),
             colours=replace(self.colours, source=np.ascontiguousarray(self.colours.source[part])),
-            thickness=_COARSE_THICKNESS,
+            thickness=max(self.thickness, _COARSE_THICKNESS),
         )
 
 
@@ -234,32 +241,20 @@ def prepare_problem(
         a, rows_a, source, w = a[order_a], rows_a[order_a], source.select(order_a), w[order_a] if len(w) else w
     if order_b is not None:
         b, rows_b, target = b[order_b], rows_b[order_b], target.select(order_b)
-    index = build_index(b)
-    spacing = median_spacing(b, index=index)
-    surfaces = has_surfaces(b, b[:: max(1, len(b) // _SURFACE_SAMPLE)], index)
-    normals, variance = np.zeros((0, d)), 0.0
-    if config.needs_normals:
-        k = neighbours_of(config, len(b), d)
-        known = target.normals is not None
-        # Given normals: a sample tells how noisy they may be.
-        at = b[:: max(1, len(b) // _NORMAL_SAMPLE)] if known else None
-        fit = fit_surfaces(b, at=at, index=index, neighbours=k)
-        # Where there are no surfaces, the normals' scatter is no noise about anything.
-        variance = float(np.median(fit.angular_variance)) if surfaces else 0.0
-        normals = _unit(target.normals) if target.normals is not None else fit.normals
-        if not normals.any():
-            words = "the target's points lie on a line or in one place and have no normals; try point-to-point"
-            return _nothing(T0, d, Status.DEGENERATE, words, dropped)
-    source_normals = np.zeros((0, d))
-    if config.needs_source_normals:
-        given = source.normals
-        source_normals = _unit(given) if given is not None else _own_normals(a, config)
+    look, source_normals = _side_by_side(
+        lambda: _look_at(b, target.normals, config),
+        lambda: _normals_of_source(a, source.normals, config),
+        alike=config.needs_source_normals and source.normals is None and target.normals is None,
+    )
+    if config.needs_normals and not look.normals.any():
+        words = "the target's points lie on a line or in one place and have no normals; try point-to-point"
+        return _nothing(T0, d, Status.DEGENERATE, words, dropped)
     colours = Colours(np.zeros(0), np.zeros(0), np.zeros((0, 3)))
     if config.method == "coloured":
         grey = intensity(target)
-        gradients = intensity_gradients(b, normals, grey, index, neighbours_of(config, len(b), d))
+        gradients = intensity_gradients(b, look.normals, grey, look.index, neighbours_of(config, len(b), d))
         colours = Colours(intensity(source), grey, gradients)
-    reach = max(SPACINGS_PER_GATE * spacing, RADII_PER_GATE * float(np.median(np.linalg.norm(b, axis=1))))
+    reach = max(SPACINGS_PER_GATE * look.spacing, RADII_PER_GATE * float(np.median(np.linalg.norm(b, axis=1))))
     return Problem(
         dimension=d,
         source=_embedded(a),
@@ -269,18 +264,21 @@ def prepare_problem(
         source_center=_embedded(center_a[None])[0],
         target_center=_embedded(center_b[None])[0],
         T_init=T0,
-        normals=_embedded(normals),
+        normals=_embedded(look.normals),
         source_normals=_embedded(source_normals),
         weights=w,
         colours=colours,
-        normal_variance=variance,
-        surfaces=surfaces,
-        index=index,
-        spacing=spacing,
+        normal_variance=look.normal_variance,
+        surfaces=look.surfaces,
+        index=look.index,
+        spacing=look.spacing,
         gate=config.max_correspondence_distance_m or reach or np.inf,
         locks=locks,
         prior=None if prior is None else _centred_prior(prior, center_a, center_b),
         dropped=dropped,
+        # A disc that noise turns is as thick as that: more trust would follow the noise.
+        thickness=max(THICKNESS, look.normal_variance),
+        angular_variance=look.angular_variance,
     )
 
 
@@ -328,8 +326,55 @@ def _unit(normals: Float64) -> Float64:
     return np.asarray(normals / np.where(lengths > 0, lengths, 1.0))
 
 
-def _own_normals(points: Float64, config: IcpConfig) -> Float64:
+@dataclass(frozen=True, slots=True)
+class _Look:
+    """What :class:`Problem` says of the target under the same names, in its own dimension."""
+
+    index: NeighbourIndex
+    spacing: float
+    surfaces: bool
+    normals: Float64
+    normal_variance: float
+    angular_variance: Float64
+
+
+def _look_at(points: Float64, normals: Float64 | None, config: IcpConfig) -> _Look:
+    index = build_index(points)
+    spacing = median_spacing(points, index=index)
+    surfaces = has_surfaces(points, points[:: max(1, len(points) // _SURFACE_SAMPLE)], index)
+    if not config.needs_normals:
+        return _Look(index, spacing, surfaces, np.zeros((0, points.shape[1])), 0.0, np.zeros(0))
+    # Given normals: a sample tells how noisy they may be.
+    at = None if normals is None else points[:: max(1, len(points) // _NORMAL_SAMPLE)]
+    fit = fit_surfaces(points, at=at, index=index, neighbours=neighbours_of(config, *points.shape))
+    # Where there are no surfaces, the normals' scatter is no noise about anything.
+    variance = float(np.median(fit.angular_variance)) if surfaces else 0.0
+    if normals is not None:
+        return _Look(index, spacing, surfaces, _unit(normals), variance, np.zeros(0))
+    return _Look(index, spacing, surfaces, fit.normals, variance, fit.angular_variance)
+
+
+def _normals_of_source(points: Float64, normals: Float64 | None, config: IcpConfig) -> Float64:
+    if not config.needs_source_normals:
+        return np.zeros((0, points.shape[1]))
+    if normals is not None:
+        return _unit(normals)
     return fit_surfaces(points, index=build_index(points), neighbours=neighbours_of(config, *points.shape)).normals
+
+
+def _side_by_side(one: Callable[[], _One], other: Callable[[], _Other], alike: bool) -> tuple[_One, _Other]:
+    """Call both. Where they are `alike` in length, two threads take one each, which spares them waiting for each other;
+    more threads share each."""
+    if not alike or get_num_threads() != 2:
+        return one(), other()
+    results: list[Any] = [None, None]
+
+    def body(start: int, stop: int) -> None:
+        with limited_threads(1):
+            results[start:stop] = [call() for call in (one, other)[start:stop]]
+
+    run_ranges(2, body)
+    return results[0], results[1]
 
 
 def _centred_prior(prior: MotionPrior, center_a: Float64, center_b: Float64) -> MotionPrior:
