@@ -79,7 +79,7 @@ def align_frames(
     source, target = build_pyramid(a, config.surfaces), build_pyramid(b, config.surfaces)
     best: RegistrationResult | None = None
     for proposal in _proposals(source, target, start, config):
-        result = _align(source, target, proposal, config)
+        result = align_proposal(source, target, proposal, config)
         if result.status is Status.CONVERGED:
             return result
         # Only from the caller's start: directions that the data leaves free must stay where that put them.
@@ -92,8 +92,16 @@ def align_frames(
 
 
 @dataclass(frozen=True, slots=True)
-class _Proposal:
-    """Where a dense alignment starts, and its schedule; features, where these proposed it."""
+class Proposal:
+    """Where a dense alignment starts.
+
+    Attributes
+    ----------
+    T_target_source : (4, 4), the start
+    projective : schedule, and limits of a trusted answer
+    features : those that proposed it; None where something else did
+    is_given : whether it is the caller's own start
+    """
 
     T_target_source: Float64
     projective: ProjectiveConfig
@@ -103,10 +111,10 @@ class _Proposal:
 
 def _proposals(
     source: SurfacePyramid, target: SurfacePyramid, start: Float64, config: TwoFrameConfig
-) -> Iterator[_Proposal]:
+) -> Iterator[Proposal]:
     """Yield what is worth trying, cheapest first; nothing is computed before it is asked for."""
     first, *wider = schedules(config.projective)
-    yield _Proposal(start, first, is_given=True)
+    yield Proposal(start, first, is_given=True)
     a, b = (_thinned(pyramid, config.max_neighbour_points) for pyramid in (source, target))
     if min(len(a), len(b)) < _MIN_POINTS:
         return
@@ -116,9 +124,9 @@ def _proposals(
     )
     features = align_features(detect(source, config.features), detect(target, config.features), config.features)
     if features.result.status.success:
-        yield _Proposal(features.result.T_target_source, strict, features)
+        yield Proposal(features.result.T_target_source, strict, features)
     for schedule in wider:
-        yield _Proposal(start, schedule, is_given=True)
+        yield Proposal(start, schedule, is_given=True)
     nearest = icp(
         a[:, :3],
         b[:, :3],
@@ -127,7 +135,7 @@ def _proposals(
         config=IcpConfig(max_correspondence_distance_m=config.neighbour_gate_m, tolerance=_ROUGHLY, attempts=_ATTEMPTS),
     )
     if nearest.status.success:
-        yield _Proposal(nearest.T_target_source, strict)
+        yield Proposal(nearest.T_target_source, strict)
 
 
 def _thinned(pyramid: SurfacePyramid, count: int) -> Float64:
@@ -138,10 +146,12 @@ def _thinned(pyramid: SurfacePyramid, count: int) -> Float64:
     return rows[rows[:, 6] > 0, :6].astype(np.float64)
 
 
-def _align(
-    source: SurfacePyramid, target: SurfacePyramid, proposal: _Proposal, config: TwoFrameConfig
+def align_proposal(
+    source: SurfacePyramid, target: SurfacePyramid, proposal: Proposal, config: TwoFrameConfig
 ) -> RegistrationResult:
-    """Align densely from a proposal, and look at the answer from all sides."""
+    """Align densely from a proposal, and look at the answer from all sides: the depth of both views, the texture on the
+    common surfaces, and the features that proposed it.
+    """
     positions, normals = surface_points(source)
     tolerant = replace(proposal.projective, min_overlap=min(config.min_overlap_alike, proposal.projective.min_overlap))
     result = align_projective(positions, normals, target.levels, proposal.T_target_source, tolerant)

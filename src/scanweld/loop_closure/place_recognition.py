@@ -1,0 +1,187 @@
+"""The memory of places: keyframes, and which of them look like a frame.
+
+Two measures of similarity. The share of ferns that agree (:mod:`~.ferns`) is there for every frame, but holds for
+nearby views only. The words that the image features share find places from half a metre and 30 degrees away, and need
+texture: a binary descriptor of 256 bits is cut into 16 words of 16 bits, and descriptors of one place, which differ in
+a few dozen bits, share some of them, others hardly ever. Where a frame has features, words decide; else ferns do.
+
+Source of the words: M. Norouzi, A. Punjani, D. Fleet, "Fast search in Hamming space with multi-index hashing", 2012.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from scanweld.arrays import Array, Float64, Int32, UInt8
+from scanweld.config import check_ranges, section, setting
+from scanweld.errors import InvalidInputError
+from scanweld.geometry.depth import SurfacePyramid
+from scanweld.loop_closure import kernels
+from scanweld.loop_closure.ferns import FernCode, Ferns, similarities
+from scanweld.loop_closure.keyframes import (
+    Keyframe,
+    KeyframeConfig,
+    Sighting,
+    keyframe_of,
+    keyframe_reason,
+    sighting_of,
+)
+from scanweld.parallel import run_ranges
+
+_WORDS = 16  # of a descriptor
+_WORD_BITS = 16
+_GRAIN = 128  # keyframes that are worth a thread
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlaceConfig:
+    """What is remembered, and how it is found."""
+
+    keyframes: KeyframeConfig = section(KeyframeConfig, "what is kept of a keyframe, and when a frame becomes one")
+    indexed_features: int = setting(
+        250, "features of a keyframe that words are taken from; raise for far views, costs time", low=10, high=10_000
+    )
+    min_features: int = setting(30, "with fewer features a frame is compared by ferns alone", low=1)
+
+    def __post_init__(self) -> None:
+        check_ranges(self)
+
+
+@dataclass(frozen=True, slots=True)
+class Candidate:
+    """A keyframe that may show the place of a frame.
+
+    Attributes
+    ----------
+    index : of the keyframe in the database
+    similarity : share of ferns that agree, 0..1
+    shared_words : words of the keyframe's features that the frame's have too
+    """
+
+    index: int
+    similarity: float
+    shared_words: int
+
+
+class KeyframeDatabase:
+    """Keyframes in the order in which they were added."""
+
+    def __init__(self, config: PlaceConfig | None = None) -> None:
+        self.config = config or PlaceConfig()
+        self.ferns = Ferns(self.config.keyframes.ferns)
+        self._keyframes: list[Keyframe] = []
+        count = self.config.keyframes.ferns.count
+        # Rows beyond the number of keyframes are room to grow.
+        self._codes: UInt8 = np.empty((0, 2, count), np.uint8)
+        self._has_grey = np.empty(0, np.bool_)
+        self._words: Array = np.empty((0, self.config.indexed_features, _WORDS), np.uint16)
+        self._num_features: Int32 = np.empty(0, np.int32)
+
+    def __len__(self) -> int:
+        return len(self._keyframes)
+
+    @property
+    def keyframes(self) -> tuple[Keyframe, ...]:
+        """All keyframes."""
+        return tuple(self._keyframes)
+
+    def __getitem__(self, index: int) -> Keyframe:
+        return self._keyframes[index]
+
+    def sight(self, pyramid: SurfacePyramid) -> Sighting:
+        """Return what has to be known of a frame to add it or to look for its place."""
+        return sighting_of(pyramid, self.ferns, self.config.keyframes)
+
+    def reason(self, pyramid: SurfacePyramid, T_world_camera: Float64) -> str:
+        """Say why a tracked frame should be added; "" when it should not (:func:`~.keyframes.keyframe_reason`)."""
+        similarity = float(self.similarities(self.ferns.encode(pyramid)).max(initial=0.0))
+        last = self._keyframes[-1] if self._keyframes else None
+        return keyframe_reason(pyramid, T_world_camera, last, similarity, self.config.keyframes)
+
+    def add(self, sighting: Sighting, T_world_camera: Float64, *, frame_index: int) -> Keyframe:
+        """Remember a frame that was seen from `T_world_camera`.
+
+        Raises
+        ------
+        InvalidInputError
+            When too little of its image has surfaces: it could never be recognised.
+        """
+        if sighting.usable < self.config.keyframes.min_usable:
+            raise InvalidInputError(
+                f"keyframe: {sighting.usable:.1%} of the image has surfaces, expected at least "
+                f"{self.config.keyframes.min_usable:.1%} (min_usable); add frames that `reason` speaks for"
+            )
+        keyframe = keyframe_of(sighting, T_world_camera, index=len(self), frame_index=frame_index)
+        row = len(self)
+        if row == len(self._has_grey):
+            self._grow()
+        self._codes[row] = keyframe.code.depth, keyframe.code.grey
+        self._has_grey[row] = keyframe.code.has_grey
+        words = words_of(keyframe.features.descriptors[: self.config.indexed_features])
+        self._words[row, : len(words)] = words
+        self._num_features[row] = len(words)
+        self._keyframes.append(keyframe)
+        return keyframe
+
+    def move(self, T_world_camera: Sequence[Float64] | Float64) -> None:
+        """Give every keyframe a new pose (K, 4, 4)."""
+        if len(T_world_camera) != len(self):
+            raise InvalidInputError(f"T_world_camera: {len(T_world_camera)} poses for {len(self)} keyframes")
+        self._keyframes = [
+            replace(keyframe, T_world_camera=np.array(T, np.float64))
+            for keyframe, T in zip(self._keyframes, T_world_camera, strict=True)
+        ]
+
+    def similarities(self, code: FernCode) -> Float64:
+        """Return the share (K,) of ferns that agree with each keyframe."""
+        codes = self._codes[: len(self)]
+        return similarities(code, codes[:, 0], codes[:, 1], self._has_grey[: len(self)])
+
+    def shared_words(self, descriptors: UInt8) -> Int32:
+        """Count (K,) the words of each keyframe's features that features with `descriptors` (N, 32) have too."""
+        present = np.zeros((_WORDS, 1 << _WORD_BITS), np.uint8)
+        present[np.arange(_WORDS), words_of(descriptors)] = 1
+        shared = np.zeros(len(self), np.int32)
+
+        def rows(start: int, stop: int) -> None:
+            kernels.count_shared_words(start, stop, self._words, self._num_features, present, shared)
+
+        run_ranges(len(self), rows, grain=_GRAIN)
+        return shared
+
+    def query(self, sighting: Sighting, k: int = 5, *, allowed: Array | None = None) -> list[Candidate]:
+        """Return the k keyframes that are most similar to a frame, best first.
+
+        Parameters
+        ----------
+        sighting : of the frame
+        allowed : (K,) bool, the keyframes that may be returned; all by default
+        """
+        if len(self) == 0:
+            return []
+        similarity = self.similarities(sighting.code)
+        if len(sighting.features) >= self.config.min_features:
+            words = self.shared_words(sighting.features.descriptors)
+        else:
+            words = np.zeros(len(self), np.int32)
+        # Ferns break ties; where there are no words they decide.
+        order = np.lexsort((-similarity, -words))
+        if allowed is not None:
+            order = order[np.asarray(allowed, np.bool_)[order]]
+        return [Candidate(int(i), float(similarity[i]), int(words[i])) for i in order[:k]]
+
+    def _grow(self) -> None:
+        rows = max(64, 2 * len(self))
+        for name in ("_codes", "_has_grey", "_words", "_num_features"):
+            old = getattr(self, name)
+            new = np.zeros((rows, *old.shape[1:]), old.dtype)
+            new[: len(old)] = old
+            setattr(self, name, new)
+
+
+def words_of(descriptors: UInt8) -> Array:
+    """Cut descriptors (N, 32) into words (N, 16) uint16."""
+    return np.ascontiguousarray(descriptors).view("<u2").astype(np.uint16).reshape(-1, _WORDS)
