@@ -4,6 +4,8 @@
    they were seen, their normals are turned to face it.
 2. Points that look alike (FPFH) are matched, and sets of matches that keep their distances and angles propose motions:
    several, because rooms and furniture repeat themselves.
+   Surfaces are placed without features, too: turns that bring the main directions of both together, each with the
+   shifts at which most surface meets and none stands where the other scan looked through.
 3. Each motion is refined on the thinned surfaces and judged: how many matches agree for the surface that is shared, how
    closely the surfaces meet, and whether one scan stands where the other looked through.
 4. The best is refined by generalised ICP. It is CONVERGED only when all of that says so and no other motion is as
@@ -40,11 +42,11 @@ logger = logging.getLogger(__name__)
 _MIN_POINTS = 100  # a cloud with fewer has no features to speak of
 _MIN_THINNED = 30  # points of a thinned cloud
 _STAGES = ((2.0, 0.5), (1.0, 0.5))  # gate and fineness of the final refinement, voxels
+_KEPT = 0.7  # share of the evidence that must be left after the refinement
 _ASTRAY = 3.0  # voxels that the refinement may move the source, on average
-_USUAL_CONFLICT = 0.004  # share of conflict that true motions hardly reach
+_MEETING = 300.0  # points of mean weight that meet are worth one feature
 _BLIND = 3.0  # times as much evidence is needed where free space says nothing
 _RIVAL = 0.5  # share of the best evidence that makes another motion as good
-_SAMPLE = 2000
 _DIFFERENT = 5.0  # voxels between two motions, on average, that make them two
 
 
@@ -67,13 +69,14 @@ class GlobalConfig:
         "clouds that were merged from several scans",
     )
     min_evidence: float = setting(
-        4.5,
-        "number of points where surfaces meet and features match, times their share of all points where surfaces meet; "
-        "three times as much where a viewpoint is unknown. Raising it trusts fewer answers",
+        3.0,
+        "number of points where surfaces meet and features match, times their share of all points where surfaces meet, "
+        "and a 300th of the points that meet; three times as much where a viewpoint is unknown. Raising it trusts "
+        "fewer answers",
         low=0.0,
     )
     min_contact: float = setting(
-        0.5, "share of the points near the other scan that must lie on its surface", low=0.0, high=1.0
+        0.3, "share of the points near the other scan that must lie on its surface", low=0.0, high=1.0
     )
     max_conflict: float = setting(
         0.03, "share of the points that may stand in the other scan's free space", low=0.0, high=1.0
@@ -94,14 +97,17 @@ class _Candidate:
 
     @property
     def evidence(self) -> float:
-        """Number of points that touch where their most similar one is, times their share of all that touch.
+        """How many features agree, and how much surface meets; the worse of both directions counts.
 
-        Walls alone touch in many ways, but hardly ever at the most similar points. The worse of both directions counts,
-        and what stands in free space weighs heavily: true motions have next to none of it.
+        Of features, the number of points that touch where their most similar one is, times their share of all that
+        touch: walls alone touch in many ways, but hardly ever at the most similar points. Of surfaces, the weight of
+        what touches, times its share of what is near. What stands in free space weighs heavily: true motions have
+        next to none of it.
         """
         pairs = zip(self.motion.support, self.agreement.touching, strict=True)
-        doubt = np.exp(-self.agreement.conflict / _USUAL_CONFLICT)
-        return float(min(count * count / max(touching, count, 1) for count, touching in pairs) * doubt)
+        features = min(count * count / max(touching, count, 1) for count, touching in pairs)
+        surfaces = self.agreement.meeting * self.agreement.contact / _MEETING
+        return float(features + surfaces) * self.agreement.belief
 
 
 def register_global(
@@ -162,20 +168,28 @@ def _register(source: Any, target: Any, scale: bool, config: GlobalConfig) -> Re
         words = f"none of the motions that {num_matches} feature matches propose can be; are these scans of one scene?"
         return _nothing(Status.NO_OVERLAP, words, dropped)
     status, reason = _verdict(candidates, scans, config)
-    motion = candidates[0].motion
-    T = motion.T.copy()
-    T[:3, 3] += center_b - motion.scale * T[:3, :3] @ center_a
-    start = replace(motion, T=T)
-    result = _refined(a, b, start, voxel_b, scale)
-    end = replace(motion, T=result.T_target_source, scale=result.scale)
+    best = candidates[0]
+    result = _refined(a, b, _between(best.motion, center_a, center_b), voxel_b, scale)
     if status is Status.CONVERGED:
-        if result.status is Status.DEGENERATE and motion.spread_m < voxel_b:
-            result = _held_by_matches(result, motion)
+        end = replace(best.motion, T=result.T_target_source, scale=result.scale)
+        end = _between(end, -center_a, -center_b)
+        kept = _Candidate(end, assess(*scans, end.T, end.scale, *views)).evidence
+        if result.status is Status.DEGENERATE and best.motion.spread_m < voxel_b:
+            result = _held_by_matches(result, best.motion)
+        elif result.status is Status.NO_OVERLAP:  # the evidence of both scans' free space is the better one
+            result = replace(result, status=Status.CONVERGED, note="")
         status = result.status
-        if distance(start, end, a[:: max(1, len(a) // _SAMPLE)]) > _ASTRAY * voxel_b:
+        if distance(best.motion, end, scans[0].points) > _ASTRAY * voxel_b or kept < _KEPT * best.evidence:
             status, reason = Status.NO_OVERLAP, "the refinement went astray: the surfaces do not hold the motion"
     note = "; ".join(filter(None, [reason, result.note, dropped]))
     return replace(result, status=status, covariance=result.covariance if status.has_pose else None, note=note)
+
+
+def _between(motion: Hypothesis, center_a: Float64, center_b: Float64) -> Hypothesis:
+    """Return the same motion between clouds whose origins are at -center_a and -center_b in its own."""
+    T = motion.T.copy()
+    T[:3, 3] += center_b - motion.scale * T[:3, :3] @ center_a
+    return replace(motion, T=T)
 
 
 def _finite(cloud: Any, name: str) -> tuple[Float64, int]:

@@ -16,8 +16,10 @@ from scanweld.parallel import run_ranges
 from scanweld.registration.closed_form import PairFit, align_closed_form, fit_pairs
 from scanweld.registration.consistency.graph import consistency_graph
 from scanweld.registration.features.matching import mutual_matches, nearest_features
-from scanweld.registration.global_search.agreement import DepthMap, conflict
+from scanweld.registration.global_search.agreement import ROUGH, DepthMap, assess, conflict
+from scanweld.registration.global_search.directions import turns
 from scanweld.registration.global_search.kernels import count_agreeing, grow_cliques
+from scanweld.registration.global_search.placement import place
 from scanweld.registration.global_search.scan import Scan
 from scanweld.registration.result import RegistrationResult
 from scanweld.registration.robust_pairs import align_clique
@@ -37,10 +39,14 @@ _CONFLICT_POINTS = 600
 _SCALE_SLACK = 0.15  # how far the ratio of the clouds' sizes may be from the scale, relative
 _PLACES = 64  # points that tell how far apart two motions are
 _DIFFERENT, _SAME = 5.0, 3.0  # voxels between two rough motions, on average, that make them two; and two refined ones
-_WIDE, _TIGHT = 3.0, 1.5  # gates of the refinement, voxels
-_WIDE_STEPS, _STEPS = 4, 10
+_WIDEST, _TIGHT = 4.0, 1.5  # gates of the refinement, voxels: it begins with the first and narrows to the last ...
+_NARROWING = 0.75  # ... by so much whenever a step is short
+_SHORT = 0.1  # voxels
+_STEPS = 30
+_REFINED = 3000  # points that refine a motion
 _CAUCHY = 2.3849
 _MIN_COSINE = 0.7
+_PLACED, _SCREENED = 80, 1000  # placements that are looked at, with so many points
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,25 +84,54 @@ def propose(
     source_view: DepthMap | None = None,
     target_view: DepthMap | None = None,
 ) -> tuple[list[Hypothesis], int]:
-    """Return at most `count` different motions, refined on the thinned surfaces, and the number of matches."""
+    """Return different motions, refined on the thinned surfaces, and the number of matches.
+
+    At most `count` come from consistent matches, and as many from placing the surfaces turn by turn.
+    """
+    views = source_view, target_view
     forward, backward = nearest_features(source.features, target.features, CANDIDATES)
     i, j = mutual_matches(forward, backward)
     voxel = target.voxel_m
     a, b = source.points[i], target.points[j]
     found: list[Hypothesis] = []
-    for clique in _consistent_sets(source, target, i, j, scale, (source_view, target_view)):
-        _, fit = align_clique(a, b, np.full(len(a), _AGREE * voxel), clique, scale=scale)
-        T, s = refine(source, target, fit.T_target_source, fit.scale if scale else 1.0, free_scale=scale)
-        agree = np.linalg.norm(se3.transform_points(T, s * a) - b, axis=1) <= _AGREE * voxel
+
+    def keep(T: Float64, s: float, clique: int) -> bool:
+        """Refine a motion and keep it, unless it is known."""
+        T, s = refine(source, target, T, s, free_scale=scale, every=-(-len(source.points) // _REFINED))
         moved = se3.transform_points(T, s * source.points)
-        spread = _spread(align_closed_form(s * a[agree], b[agree]), moved)
         support = _support(moved, target.points, forward, voxel), _support(target.points, moved, backward, voxel)
-        hypothesis = Hypothesis(T, s, support, len(clique), spread)
-        if all(distance(hypothesis, other, source.points) > _SAME * voxel for other in found):
+        agree = np.linalg.norm(se3.transform_points(T, s * a) - b, axis=1) <= _AGREE * voxel
+        spread = _spread(align_closed_form(s * a[agree], b[agree]), moved)
+        hypothesis = Hypothesis(T, s, support, clique, spread)
+        new = all(distance(hypothesis, other, source.points) > _SAME * voxel for other in found)
+        if new:
             found.append(hypothesis)
-        if len(found) == count:
+        return new
+
+    matched = 0
+    for clique in _consistent_sets(source, target, i, j, scale, views):
+        _, fit = align_clique(a, b, np.full(len(a), _AGREE * voxel), clique, scale=scale)
+        matched += keep(fit.T_target_source, fit.scale if scale else 1.0, len(clique))
+        if matched == count:
+            break
+    placed = 0
+    for T in [] if scale else _placed(source, target, views):
+        placed += keep(T, 1.0, 0)
+        if placed == count:
             break
     return found, len(i)
+
+
+def _placed(source: Scan, target: Scan, views: tuple[DepthMap | None, DepthMap | None]) -> list[Float64]:
+    """Return motions whose surfaces meet after a turn and a shift, those that meet best after a few steps first."""
+    rotations = turns(source.normals, target.normals, oriented=source.oriented)
+    every = tuple(-(-len(scan.points) // _SCREENED) for scan in (source, target))
+    ranked: list[tuple[float, int, Float64]] = []
+    for k, start in enumerate(place(source, target, rotations, views, _PLACED)):
+        T, _ = refine(source, target, start, 1.0, every=every[0])
+        agreement = assess(source, target, T, 1.0, *views, every=(every[0], every[1]), margin=ROUGH)
+        ranked.append((-agreement.meeting * agreement.belief, k, T))
+    return [T for _, _, T in sorted(ranked, key=lambda item: item[:2])]
 
 
 def _consistent_sets(
@@ -175,16 +210,22 @@ def distance(one: Hypothesis, other: Hypothesis, points: Float64) -> float:
     return float(np.linalg.norm(one.apply(points) - other.apply(points), axis=1).mean())
 
 
-def refine(source: Scan, target: Scan, T: Float64, scale: float, *, free_scale: bool = False) -> tuple[Float64, float]:
-    """Improve a motion by a few robust point-to-plane steps on the thinned scans, wide gate first."""
+def refine(
+    source: Scan, target: Scan, T: Float64, scale: float, *, free_scale: bool = False, every: int = 1
+) -> tuple[Float64, float]:
+    """Improve a motion by a few robust point-to-plane steps on the thinned scans, wide gate first.
+
+    With `every` = k only each k-th point of the source is looked at.
+    """
     voxel = target.voxel_m
-    for step in range(_STEPS):
-        gate = (_WIDE if step < _WIDE_STEPS else _TIGHT) * voxel
-        moved = se3.transform_points(T, scale * source.points)
+    points, facing, worth = source.points[::every], source.normals[::every], source.weights[::every]
+    gate = _WIDEST * voxel
+    for _ in range(_STEPS):
+        moved = se3.transform_points(T, scale * points)
         distances, partners = target.index.nearest(moved, gate)
         near = np.flatnonzero(np.isfinite(distances))
         normals = target.normals[partners[near]]
-        cosine = np.einsum("nd,nd->n", source.normals[near] @ T[:3, :3].T, normals)
+        cosine = np.einsum("nd,nd->n", facing[near] @ T[:3, :3].T, normals)
         kept = (cosine if source.oriented else np.abs(cosine)) > _MIN_COSINE
         near, normals = near[kept], normals[kept]
         if len(near) < 12:
@@ -192,7 +233,7 @@ def refine(source: Scan, target: Scan, T: Float64, scale: float, *, free_scale: 
         p, q = moved[near], target.points[partners[near]]
         r = np.einsum("nd,nd->n", normals, p - q)
         noise = max(1.4826 * float(np.median(np.abs(r))), 1e-3 * voxel)
-        weights = 1 / (1 + (r / (_CAUCHY * noise)) ** 2)
+        weights = worth[near] / (1 + (r / (_CAUCHY * noise)) ** 2)
         center = p.mean(axis=0)
         arm = p - center
         jacobian = np.concatenate([normals, np.cross(arm, normals)], axis=1)
@@ -206,5 +247,10 @@ def refine(source: Scan, target: Scan, T: Float64, scale: float, *, free_scale: 
         moved_T = np.eye(4)
         moved_T[:3, :3] = turn[:3, :3] @ T[:3, :3]
         moved_T[:3, 3] = turn[:3, :3] @ (ratio * (T[:3, 3] - center)) + turn[:3, 3] + center
+        reach = np.linalg.norm(xi[:3]) + np.linalg.norm(xi[3:]) * np.linalg.norm(arm, axis=1).mean()
         T, scale = moved_T, scale * ratio
+        if reach < _SHORT * voxel:
+            if gate <= _TIGHT * voxel:
+                break
+            gate = max(_NARROWING * gate, _TIGHT * voxel)
     return T, scale

@@ -22,6 +22,8 @@ _VOXELS_PER_RADIUS = 30.0  # voxels to the median distance from the centre: 5 cm
 _SPACINGS_PER_VOXEL = 1.5
 _MOST_POINTS = 12_000  # a thinned cloud with more is thinned further
 _GROWTH = 1.15
+_PLANE_SAMPLE, _PLANE_BLOCK = 1500, 2000  # points that stand for all, and points looked at together
+_PLANE_THICKNESS, _PLANE_COSINE = 1.5, 0.97  # voxels, and cosine of the normals, within which points are in one plane
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +38,7 @@ class Scan:
     index : of the points
     viewpoint : (3,), or None
     voxel_m : side of the voxels
+    weights : (N,), mean 1: what a point tells; those of large planes, which fit many places, tell less
     """
 
     points: Float64
@@ -44,6 +47,7 @@ class Scan:
     index: NeighbourIndex
     viewpoint: Float64 | None
     voxel_m: float
+    weights: Float64
 
     @property
     def oriented(self) -> bool:
@@ -77,4 +81,20 @@ def prepare_scan(points: Float64, voxel_m: float, viewpoint: Float64 | None) -> 
         compute_fpfh(thinned, normals, radius * voxel_m, oriented=viewpoint is not None, index=index)
         for radius in FEATURE_RADII
     ]
-    return Scan(thinned, np.ascontiguousarray(normals), np.hstack(features), index, viewpoint, voxel_m)
+    weights = _plane_shares(thinned, normals, voxel_m) ** -0.5
+    return Scan(
+        thinned, np.ascontiguousarray(normals), np.hstack(features), index, viewpoint, voxel_m, weights / weights.mean()
+    )
+
+
+def _plane_shares(points: Float64, normals: Float64, voxel_m: float) -> Float64:
+    """Share (N,) of the points (N, 3) that lie in the plane of each point."""
+    some = slice(None, None, -(-len(points) // _PLANE_SAMPLE))
+    others, facing = points[some], normals[some]
+    shares = np.empty(len(points))
+    for start in range(0, len(points), _PLANE_BLOCK):
+        rows = slice(start, start + _PLANE_BLOCK)
+        across = (points[rows] * normals[rows]).sum(axis=1)[:, None] - normals[rows] @ others.T
+        flush = (np.abs(across) < _PLANE_THICKNESS * voxel_m) & (np.abs(normals[rows] @ facing.T) > _PLANE_COSINE)
+        shares[rows] = flush.mean(axis=1)
+    return np.maximum(shares, 1 / len(others))

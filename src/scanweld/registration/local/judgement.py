@@ -10,7 +10,14 @@ from scanweld.arrays import Float64, Int64
 from scanweld.geometry import se3
 from scanweld.geometry.normals import SurfaceFit
 from scanweld.registration.closed_form import RANK_TOLERANCE
-from scanweld.registration.gauss_newton import NormalEquations, Spectrum, free_directions, moved_origin, solve
+from scanweld.registration.gauss_newton import (
+    NormalEquations,
+    Spectrum,
+    free_directions,
+    moved_origin,
+    solve,
+    standard_deviation,
+)
 from scanweld.registration.local import kernels
 from scanweld.registration.local.config import IcpConfig, kernel_of
 from scanweld.registration.local.covariance import scatter, slope, softened
@@ -29,6 +36,7 @@ from scanweld.registration.residuals import normal_equations, point_to_plane
 from scanweld.registration.result import FreeDirection, RegistrationResult, Status
 from scanweld.registration.robust import Cauchy, mad_scale
 
+_SURELY = 3.0  # standard deviations
 _PULLED, _PULLED_POINTS = 0.25, 0.4  # spacings; pairs of points show the sampling
 _SHARED = 0.7  # different targets per pair, below which the sharing is worth a word
 
@@ -214,7 +222,8 @@ def _pull(problem: Problem, config: IcpConfig, evidence: Evidence) -> str:
     """Say how far an answer is from where the surfaces want it, or "" where that is near.
 
     Points beyond the rim of the target pull on point-to-point, and on the others from afar; small steps do not tell.
-    Right answers are within a tenth of a spacing of what point-to-plane would answer, of point-to-point within a third.
+    Right answers are within a tenth of a spacing of what point-to-plane would answer, of point-to-point within a third,
+    or as near as the sample can tell.
     """
     if config.method == "coloured" or problem.prior is not None or problem.uneven:  # the spacing says nothing there
         return ""
@@ -222,7 +231,9 @@ def _pull(problem: Problem, config: IcpConfig, evidence: Evidence) -> str:
         return ""
     equations, parts = _sliding(problem, evidence)
     asked = float(np.linalg.norm(np.linalg.lstsq(parts.basis, solve(equations, parts), rcond=None)[0]))
-    if asked <= (_PULLED_POINTS if config.method == "point-to-point" else _PULLED) * problem.spacing:
+    least = (_PULLED_POINTS if config.method == "point-to-point" else _PULLED) * problem.spacing
+    known_to = mad_scale(_surface_rows(problem, evidence)[0]) * standard_deviation(equations, parts)
+    if asked <= max(least, _SURELY * known_to):
         return ""
     return (
         f"the surfaces do not meet: point-to-plane would move on by {asked:.3g} m or more, as where points beyond the "

@@ -1,0 +1,221 @@
+"""Photometric residuals of moved points: their rows, their sums, and their scale in this frame.
+
+A point of brightness I_model, moved to p, is seen at the pixel pi(p) of a frame whose exposure may differ by a gain and
+an offset: r = gain I_model + offset - I(pi(p)) (Steinbruecker et al. 2011; affine brightness as in Engel et al. 2015).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from scanweld.arrays import Bool, Float32, Float64, Int64, UInt8
+from scanweld.geometry.depth import SurfaceLevel, as_kernel_input, intrinsics_array
+from scanweld.parallel import run_ranges
+from scanweld.registration.photometric import kernels
+
+FREEDOM = 5.0
+"""Degrees of freedom of Student's t, as Kerl et al. 2013 measured for photometric residuals."""
+
+SCALE_SAMPLES = 4000
+"""Points that the scale and the brightness are estimated from."""
+
+MIN_SCALE = 0.5
+"""Smallest scale of the residuals [grey levels]: rounding alone gives 0.3."""
+
+GAIN_STD = 0.3
+"""How far exposure is expected to change the gain; what holds it where everything is equally bright."""
+
+
+@dataclass(frozen=True, slots=True)
+class Brightness:
+    """I_frame = gain I_model + offset, up to residuals of a robust standard deviation [grey levels]."""
+
+    gain: float = 1.0
+    offset: float = 0.0
+    scale: float = 10.0
+
+    @property
+    def model(self) -> Float32:
+        """What the kernel takes."""
+        return np.array([self.gain, self.offset, 1 / self.scale, FREEDOM], np.float32)
+
+
+@dataclass(frozen=True, slots=True)
+class LitPoints:
+    """Points with brightness: positions, normals (3, N), intensities (N,) float32, source frame."""
+
+    positions_m: Float32
+    normals: Float32
+    intensities: Float32
+
+    def every(self, stride: int) -> LitPoints:
+        """A strided copy."""
+        return LitPoints(
+            self.positions_m[:, ::stride].copy(), self.normals[:, ::stride].copy(), self.intensities[::stride].copy()
+        )
+
+    def __len__(self) -> int:
+        return len(self.intensities)
+
+
+@dataclass(frozen=True, slots=True)
+class LitTarget:
+    """A pyramid level with brightness: grey (H, W) float32 in 0..255."""
+
+    surface: SurfaceLevel
+    grey: Float32
+
+
+@dataclass(frozen=True, slots=True)
+class PhotometricSums:
+    """Normal equations of K parts of the points, brightness eliminated or not (columns: motion, gain, offset).
+
+    information (K, 8, 8), gradient (K, 8), loss (K,), matched (K,).
+    """
+
+    information: Float64
+    gradient: Float64
+    loss: Float64
+    matched: Int64
+
+
+def luminance(color: UInt8) -> Float32:
+    """Return the grey image (H, W) float32, 0..255, of a colour image (H, W, 3) uint8."""
+    color = as_kernel_input(color, np.uint8)
+    grey = np.empty(color.shape[:2], np.float32)
+    run_ranges(grey.shape[0], lambda start, stop: kernels.luminance_rows(start, stop, color, grey))
+    return grey
+
+
+def half_grey(grey: Float32) -> Float32:
+    """Return the means of 2x2 blocks (H // 2, W // 2); an odd last row or column is dropped."""
+    height, width = grey.shape[0] // 2 * 2, grey.shape[1] // 2 * 2
+    even = grey[:height, :width]
+    return np.ascontiguousarray((even[::2, ::2] + even[1::2, ::2] + even[::2, 1::2] + even[1::2, 1::2]) / 4)
+
+
+def photometric_sums(
+    points: LitPoints,
+    target: LitTarget,
+    T_target_source: Float64,
+    brightness: Brightness,
+    gate_m: float,
+    min_cosine: float,
+    parts: int = 1,
+) -> PhotometricSums:
+    """Sum the photometric normal equations of `parts` contiguous shares of the points."""
+    bounds = np.linspace(0, len(points), parts + 1).astype(np.int64)
+    partials = np.empty((parts, kernels.SUMS))
+    transform = T_target_source[:3].astype(np.float32)
+    surface = target.surface.surface.reshape(-1, 8)
+    intrinsics = intrinsics_array(target.surface.camera)
+    limits = np.array([gate_m, min_cosine], np.float32)
+    model = brightness.model
+
+    def body(start: int, stop: int) -> None:
+        kernels.photometric_sums(
+            start, stop, bounds, points.positions_m, points.normals, points.intensities, transform, surface,
+            target.grey, intrinsics, limits, model, partials,
+        )  # fmt: skip
+
+    run_ranges(parts, body)
+    full = np.zeros((parts, kernels.COLUMNS, kernels.COLUMNS))
+    rows, columns = np.triu_indices(kernels.COLUMNS)
+    full[:, rows, columns] = partials[:, :45]
+    full[:, columns, rows] = partials[:, :45]
+    return PhotometricSums(full[:, :8, :8], full[:, :8, 8], partials[:, 45], partials[:, 46].astype(np.int64))
+
+
+@dataclass(frozen=True, slots=True)
+class PhotometricRows:
+    """What NumPy makes of the residuals, for few points and for tests.
+
+    Attributes
+    ----------
+    jacobian : (M, 8), of the motion, the gain and the offset [grey levels]
+    residuals : (M,) [grey levels]
+    seen : (N,) bool, the M points that count
+    model, frame : (M,) intensities
+    """
+
+    jacobian: Float64
+    residuals: Float64
+    seen: Bool
+    model: Float64
+    frame: Float64
+
+
+def reference_rows(
+    points: LitPoints,
+    target: LitTarget,
+    T_target_source: Float64,
+    brightness: Brightness,
+    gate_m: float,
+    min_cosine: float,
+) -> PhotometricRows:
+    """Compute in NumPy what the kernel `photometric_rows` computes, in double precision and without weights."""
+    camera, grey = target.surface.camera, target.grey.astype(np.float64)
+    R, t = T_target_source[:3, :3], T_target_source[:3, 3]
+    p = points.positions_m.T.astype(np.float64) @ R.T + t
+    n = points.normals.T.astype(np.float64) @ R.T
+    z = np.where(p[:, 2] > 1e-3, p[:, 2], np.inf)
+    u, v = camera.fx * p[:, 0] / z + camera.cx, camera.fy * p[:, 1] / z + camera.cy
+    seen = np.isfinite(z) & (u >= 0) & (u < camera.width - 1) & (v >= 0) & (v < camera.height - 1)
+    at = np.floor(np.where(seen, v, 0) + 0.5).astype(np.int64), np.floor(np.where(seen, u, 0) + 0.5).astype(np.int64)
+    q = target.surface.surface[at].astype(np.float64)
+    seen &= (q[:, 6] > 0) & (((p - q[:, :3]) ** 2).sum(axis=1) < gate_m**2) & ((n * q[:, 3:6]).sum(axis=1) > min_cosine)
+    p, u, v, model = p[seen], u[seen], v[seen], points.intensities[seen].astype(np.float64)
+    column, row = np.floor(u).astype(np.int64), np.floor(v).astype(np.int64)
+    e, f = u - column, v - row
+    corners = [[grey[row + j, column + i] for i in (0, 1)] for j in (0, 1)]
+    frame = (1 - f) * ((1 - e) * corners[0][0] + e * corners[0][1]) + f * (
+        (1 - e) * corners[1][0] + e * corners[1][1]
+    )
+    slope_u = (1 - f) * (corners[0][1] - corners[0][0]) + f * (corners[1][1] - corners[1][0])
+    slope_v = (1 - e) * (corners[1][0] - corners[0][0]) + e * (corners[1][1] - corners[0][1])
+    d = np.zeros_like(p)
+    d[:, 0], d[:, 1] = -slope_u * camera.fx / p[:, 2], -slope_v * camera.fy / p[:, 2]
+    d[:, 2] = -(d[:, 0] * p[:, 0] + d[:, 1] * p[:, 1]) / p[:, 2]
+    jacobian = np.concatenate([d, np.cross(p, d), model[:, None], np.ones((len(p), 1))], axis=1)
+    return PhotometricRows(jacobian, brightness.gain * model + brightness.offset - frame, seen, model, frame)
+
+
+def estimate_brightness(
+    points: LitPoints, target: LitTarget, T_target_source: Float64, gate_m: float, min_cosine: float
+) -> tuple[Brightness, int]:
+    """Fit gain, offset and the scale of the residuals at a pose, from a sample of the points.
+
+    Robust regression with Student's t and the median absolute deviation as the scale; returns the number of samples,
+    too.
+    """
+    few = points.every(max(1, len(points) // SCALE_SAMPLES))
+    rows = reference_rows(few, target, T_target_source, Brightness(), gate_m, min_cosine)
+    model, frame = rows.model, rows.frame
+    if len(model) < 2:
+        return Brightness(), len(model)
+    gain, offset = 1.0, float(np.median(frame - model))
+    scale = MIN_SCALE
+    for _ in range(5):
+        residuals = gain * model + offset - frame
+        scale = max(MIN_SCALE, 1.4826 * float(np.median(np.abs(residuals - np.median(residuals)))))
+        weights = (FREEDOM + 1) / (FREEDOM + (residuals / scale) ** 2) / scale**2
+        total = weights.sum()
+        mean_model, mean_frame = (weights @ model) / total, (weights @ frame) / total
+        spread = weights @ (model - mean_model) ** 2 + 1 / GAIN_STD**2
+        gain = float((weights @ ((model - mean_model) * (frame - mean_frame)) + 1 / GAIN_STD**2) / spread)
+        offset = float(mean_frame - gain * mean_model)
+    return Brightness(gain, offset, scale), len(model)
+
+
+def eliminate_brightness(sums: PhotometricSums, brightness: Brightness) -> tuple[Float64, Float64]:
+    """Remove gain and offset from the sums by the Schur complement.
+
+    Returns the information (6, 6) of all parts and the scores (K, 6) of each, which add up to the gradient.
+    """
+    H, g = sums.information.sum(axis=0), sums.gradient
+    corner = H[6:, 6:] + np.diag([1 / GAIN_STD**2, 1e-9])
+    pull = np.array([(brightness.gain - 1) / GAIN_STD**2, 0.0]) / len(g)
+    mix = np.linalg.solve(corner, H[6:, :6]).T
+    return H[:6, :6] - mix @ H[6:, :6], g[:, :6] - (g[:, 6:] + pull) @ mix.T
