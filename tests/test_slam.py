@@ -228,7 +228,8 @@ class FakeMapper:
         none = np.zeros((3, 0), np.float32)
         return sw.ModelView(T_world_camera, camera, none, none, none[0], np.full(camera.shape, -1, np.int32))
 
-    def fuse(self, pyramid: object, T_world_camera: np.ndarray) -> None:
+    def fuse(self, pyramid: object, T_world_camera: np.ndarray, *, keyframe: int, moving: object) -> None:
+        assert keyframe == FakeLoopCloser.keyframe
         self.asked["fuse"] += 1
         self.map.append(T_world_camera)
 
@@ -237,6 +238,12 @@ class FakeMapper:
 
 
 class FakeLoopCloser:
+    keyframe = 7
+    num_closures = 0
+
+    def relocalise(self, pyramid: object) -> sw.RegistrationResult:
+        return sw.NoLoopCloser().relocalise(sw.build_pyramid(rendered(count=40).frames[0]))
+
     def process(self, pyramid: object, result: sw.FrameResult) -> sw.MapCorrection | None:
         return sw.MapCorrection(np.zeros(1, np.int32), np.eye(4)[None]) if result.index == 2 else None
 

@@ -52,8 +52,8 @@ class TestTracker:
         sequence = rendered(count=40)
         mapper, guess = map_of(sequence, 5), sequence.ground_truth.T_world_camera[5]
         view, pyramid = mapper.view(guess, CAMERA), sw.build_pyramid(sequence.frames[5])
-        tracked = sw.FrameToModelTracker().track(pyramid, view, guess)
-        tracker = sw.FrameToModelTracker()
+        tracker = sw.FrameToModelTracker(sw.TrackingConfig(photometry="off"))
+        tracked = tracker.track(pyramid, view, guess)
         source = tracker._select(view)
         aligned = align_projective(*source, pyramid.levels, se3.inverse(guess), tracker.config.projective)
         T_wc, T_cw = tracked.T_target_source, aligned.T_target_source

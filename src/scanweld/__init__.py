@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from scanweld.io.ply import read_ply, write_ply
     from scanweld.io.point_files import read_points, write_points
     from scanweld.io.trajectory_files import read_trajectory, write_tum
-    from scanweld.loop_closure.loop_closer import NoLoopCloser
+    from scanweld.loop_closure.loop_closer import KeyframeLoopCloser, LoopClosingConfig, NoLoopCloser
     from scanweld.mapping.fusion import FusionConfig
     from scanweld.mapping.mapper import SurfelMapper
     from scanweld.mapping.rendering import render_picture
@@ -66,7 +66,10 @@ if TYPE_CHECKING:
     from scanweld.registration.robust_pairs import RobustAlignment, align_pairs_robustly
     from scanweld.registration.uncertainty import point_covariances
     from scanweld.runs.run import RunSummary, run_sequence
+    from scanweld.slam.health import HealthConfig
     from scanweld.slam.system import Slam, SlamConfig, build_slam
+    from scanweld.tracking.dynamics import DynamicsConfig
+    from scanweld.tracking.rotation import RotationPrior
     from scanweld.tracking.tracker import FrameToModelTracker, TrackingConfig
     from scanweld.tracking.two_frames import TwoFrameConfig, align_frames
     from scanweld.trajectory import FrameResult, FrameState, Trajectory
@@ -96,7 +99,7 @@ _HOME = {
     "io.ply": ("read_ply", "write_ply"),
     "io.point_files": ("read_points", "write_points"),
     "io.trajectory_files": ("read_trajectory", "write_tum"),
-    "loop_closure.loop_closer": ("NoLoopCloser",),
+    "loop_closure.loop_closer": ("KeyframeLoopCloser", "LoopClosingConfig", "NoLoopCloser"),
     "mapping.fusion": ("FusionConfig",),
     "mapping.mapper": ("SurfelMapper",),
     "mapping.rendering": ("render_picture",),
@@ -116,7 +119,10 @@ _HOME = {
     "registration.robust_pairs": ("RobustAlignment", "align_pairs_robustly"),
     "registration.uncertainty": ("point_covariances",),
     "runs.run": ("RunSummary", "run_sequence"),
+    "slam.health": ("HealthConfig",),
     "slam.system": ("Slam", "SlamConfig", "build_slam"),
+    "tracking.dynamics": ("DynamicsConfig",),
+    "tracking.rotation": ("RotationPrior",),
     "tracking.tracker": ("FrameToModelTracker", "TrackingConfig"),
     "tracking.two_frames": ("TwoFrameConfig", "align_frames"),
     "trajectory": ("FrameResult", "FrameState", "Trajectory"),
@@ -127,6 +133,7 @@ __all__ = [
     "ClosedFormBatch",
     "ConfigError",
     "DatasetError",
+    "DynamicsConfig",
     "FileFormatError",
     "Frame",
     "FrameResult",
@@ -134,8 +141,11 @@ __all__ = [
     "FrameToModelTracker",
     "FusionConfig",
     "GlobalConfig",
+    "HealthConfig",
     "IcpConfig",
     "InvalidInputError",
+    "KeyframeLoopCloser",
+    "LoopClosingConfig",
     "ManyConfig",
     "ManyResult",
     "MapCorrection",
@@ -154,6 +164,7 @@ __all__ = [
     "RenderConfig",
     "RgbdSequence",
     "RobustAlignment",
+    "RotationPrior",
     "RunSummary",
     "ScanPair",
     "ScanweldError",

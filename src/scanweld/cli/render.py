@@ -15,12 +15,12 @@ Option = typer.Option
 
 def render(
     out: Annotated[Path, Option(help="Folder to write the sequence to (TUM RGB-D layout).", metavar="SEQUENCE")],
-    scene: Annotated[str | None, Option(help="room or corridor (a loop of rooms). Default: room.")] = None,
+    scene: Annotated[str | None, Option(help="room, corridor (a loop), twin-rooms or wall. Default: room.")] = None,
     path: Annotated[
         str | None,
         Option(
-            help="Camera path: orbit or sweep (room), loop (corridor), or a trajectory file (TUM, 3x4 rows, "
-            "Redwood log, also gzipped). Default: the scene's first.",
+            help="Camera path: orbit or sweep (room), loop (corridor), visit (twin-rooms), plain or brick (wall), or a "
+            "trajectory file (TUM, 3x4 rows, Redwood log, also gzipped). Default: the scene's first.",
             metavar="NAME|FILE",
         ),
     ] = None,

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from scanweld.arrays import Float32, UInt8
+from scanweld.arrays import Bool, Float32, UInt8
 from scanweld.errors import InvalidInputError
 from scanweld.geometry.camera import PinholeCamera
 
@@ -44,3 +44,17 @@ class Frame:
                 f"frame: color must be (H, W, 3) uint8 of the size of the depth {self.camera.shape}, "
                 f"got {self.color.shape} {self.color.dtype}"
             )
+
+    def without(self, mask: Bool) -> Frame:
+        """Return the frame without depth where `mask` (H, W) bool is true: such pixels are not tracked and not mapped.
+
+        Raises
+        ------
+        InvalidInputError
+            When the mask is not boolean or not of the depth's size.
+        """
+        if mask.shape != self.depth_m.shape or mask.dtype != np.bool_:
+            raise InvalidInputError(
+                f"frame: expected a bool mask of the depth's shape {self.depth_m.shape}, got {mask.shape} {mask.dtype}"
+            )
+        return replace(self, depth_m=np.where(mask, np.float32(0), self.depth_m))

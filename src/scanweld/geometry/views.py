@@ -22,6 +22,7 @@ class ModelView:
     normals : (3, N) float32, world frame, unit, towards the camera
     confidences : (N,) float32
     index_map : (H, W) int32, the surfel behind each pixel, -1 where none
+    intensities : (N,) float32, luminance 0..255, or None where the mapper does not give it
     stable_confidence : from this confidence on a surfel is stable
     """
 
@@ -32,6 +33,7 @@ class ModelView:
     confidences: Float32
     index_map: Int32
     stable_confidence: float = 0.0
+    intensities: Float32 | None = None
 
     def __len__(self) -> int:
         return int(self.positions_m.shape[1])

@@ -7,7 +7,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from scanweld.arrays import Float32, Float64, Int32
+from scanweld.arrays import Bool, Float32, Float64, Int32, Int64, UInt8
 from scanweld.config import check_ranges, setting
 from scanweld.geometry.camera import PinholeCamera
 from scanweld.geometry.depth import SurfacePyramid, as_kernel_input, intrinsics_array
@@ -80,8 +80,12 @@ def fuse(
     frame_id: int,
     config: FusionConfig,
     index_map: Int32 | None = None,
+    moving: Bool | None = None,
 ) -> FusionCounts:
-    """Merge a frame into the map, in place; `index_map` (H, W) is that of the pose where it is known already."""
+    """Merge a frame into the map, in place; `index_map` (H, W) is that of the pose where it is known already.
+
+    Pixels in `moving` (H, W) add nothing to the map, and surfels that they lie on are demoted.
+    """
     level = pyramid.levels[0]
     camera, surface = level.camera, level.surface
     color = pyramid.frame.color
@@ -122,6 +126,8 @@ def fuse(
 
     # Two passes: every decision sees the map as it was, whichever thread comes first.
     run_ranges(camera.height, associate)
+    if moving is not None:
+        demote(surfels, index_map, action, row_counts, moving)
     run_ranges(camera.height, merge)
     offsets = len(surfels) + np.concatenate([[0], np.cumsum(row_counts)])
     new = int(offsets[-1]) - len(surfels)
@@ -138,6 +144,22 @@ def fuse(
     interval = max(config.clean_interval, len(surfels) // TIDIED_PER_FRAME)
     removed = tidy(surfels, index_map, frame_id, config) if frame_id % interval == 0 else 0
     return FusionCounts(new, removed)
+
+
+MOVED_CONFIDENCE = 1.0
+"""Confidence of a surfel that something moving lies on: that of one measurement (Keller et al. 2013, sec. 6)."""
+
+
+def demote(surfels: SurfelMap, index_map: Int32, action: UInt8, row_counts: Int64, moving: Bool) -> None:
+    """Take the `moving` pixels (H, W) out of the frame's actions, and the confidence of the surfels they lie on.
+
+    What they look through still counts as seen through. `action` (H, W) and `row_counts` (H,) are changed.
+    """
+    lies_on = index_map[moving & ((action & kernels.MERGE) > 0)]
+    confidences = surfels.arrays.confidences
+    confidences[lies_on] = np.minimum(confidences[lies_on], np.float32(MOVED_CONFIDENCE))
+    action[moving] &= kernels.SEEN_THROUGH
+    row_counts[:] = np.count_nonzero(action & kernels.APPEND, axis=1)
 
 
 TIDIED_PER_FRAME = 20_000

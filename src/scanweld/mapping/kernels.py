@@ -120,6 +120,19 @@ def gather_view(
                 k += 1
 
 
+@kernel
+def gather_intensities(start, stop, index_map, offsets, colors, out):
+    """Luminance (ITU-R BT.601) of the surfels of index-map rows start..stop, as `gather_view` orders them."""
+    for v in range(start, stop):
+        k = offsets[v]
+        for u in range(index_map.shape[1]):
+            i = index_map[v, u]
+            if i >= 0:
+                red, green, blue = colors[0, i], colors[1, i], colors[2, i]
+                out[k] = np.float32(0.299) * red + np.float32(0.587) * green + np.float32(0.114) * blue
+                k += 1
+
+
 APPEND, MERGE, SEEN_THROUGH = np.uint8(1), np.uint8(2), np.uint8(4)
 """What a pixel asks of the map, as bits."""
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from scanweld.arrays import Float64, Int32
+from scanweld.arrays import Bool, Float64, Int32
 from scanweld.geometry import se3
 from scanweld.geometry.camera import PinholeCamera
 from scanweld.geometry.depth import SurfacePyramid
@@ -37,14 +37,20 @@ class SurfelMapper:
         self._index_map = seen.index_map
         return seen
 
-    def fuse(self, pyramid: SurfacePyramid, T_world_camera: Float64) -> FusionCounts:
-        """Merge a frame seen from `T_world_camera` into the map."""
+    def fuse(
+        self, pyramid: SurfacePyramid, T_world_camera: Float64, *, keyframe: int = 0, moving: Bool | None = None
+    ) -> FusionCounts:
+        """Merge a frame seen from `T_world_camera` into the map, but for the pixels (H, W) that are `moving`.
+
+        New surfels move with `keyframe`.
+        """
+        self.map.anchor = keyframe
         camera, candidates, index_map = pyramid.levels[0].camera, self._candidates, None
         if candidates is None or self._moved_pixels(T_world_camera, camera, NEAREST_M) > VIEW_MARGIN_PIXELS:
             candidates = find_candidates(self.map, T_world_camera, camera)
         elif self._moved_pixels(T_world_camera, camera, TYPICAL_M) < SAME_VIEW_PIXELS:
             index_map = self._index_map
-        counts = fuse(self.map, candidates, pyramid, T_world_camera, self._frames_fused, self.config, index_map)
+        counts = fuse(self.map, candidates, pyramid, T_world_camera, self._frames_fused, self.config, index_map, moving)
         self._frames_fused += 1
         self._candidates = self._index_map = None
         return counts

@@ -116,6 +116,8 @@ def render_model_view(
     T_world_camera: Float64,
     camera: PinholeCamera,
     stable_confidence: float = 0.0,
+    *,
+    intensities: bool = True,
 ) -> ModelView:
     """Return the visible surfels, one at most per pixel, in row-major order of the pixels."""
     index_map, row_counts = render_index_map(surfels, candidates, T_world_camera, camera, stable_confidence)
@@ -123,6 +125,7 @@ def render_model_view(
     total = int(offsets[-1])
     positions, normals = np.empty((3, total), np.float32), np.empty((3, total), np.float32)
     confidences = np.empty(total, np.float32)
+    grey = np.empty(total if intensities else 0, np.float32)
     arrays = surfels.arrays
 
     def body(start: int, stop: int) -> None:
@@ -130,9 +133,14 @@ def render_model_view(
             start, stop, index_map, offsets, arrays.positions, arrays.normals, arrays.confidences,
             positions, normals, confidences,
         )  # fmt: skip
+        if intensities:
+            kernels.gather_intensities(start, stop, index_map, offsets, arrays.colors, grey)
 
     run_ranges(camera.height, body)
-    return ModelView(T_world_camera, camera, positions, normals, confidences, index_map, stable_confidence)
+    return ModelView(
+        T_world_camera, camera, positions, normals, confidences, index_map, stable_confidence,
+        grey if intensities else None,
+    )  # fmt: skip
 
 
 BACKGROUND = 216

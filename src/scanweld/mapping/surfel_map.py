@@ -23,6 +23,9 @@ _COLUMNS: tuple[tuple[str, int, type], ...] = (
 )
 
 
+_MOVED_AT_ONCE = 1 << 14
+"""Surfels moved at a time: the transforms of all at once would take more memory than the map."""
+
 ROW_PADDING = 2064
 """Extra columns: 129 cache lines, so that neighbouring rows are 129 cache sets apart."""
 
@@ -71,6 +74,8 @@ class SurfelMap:
     def __init__(self, capacity: int = 1 << 16) -> None:
         self._arrays = SurfelArrays.empty(max(16, capacity))
         self._count = 0
+        self.anchor = 0
+        """Keyframe that new surfels move with."""
 
     def __len__(self) -> int:
         return self._count
@@ -137,11 +142,11 @@ class SurfelMap:
             self._arrays = grown
         return self._arrays
 
-    def extend(self, more: int, anchor: int = 0) -> None:
-        """Count `more` surfels that a kernel wrote behind the live ones, anchored to a keyframe."""
+    def extend(self, more: int, anchor: int | None = None) -> None:
+        """Count `more` surfels that a kernel wrote behind the live ones; they move with `anchor`, or the map's own."""
         if not 0 <= more <= self.capacity - self._count:
             raise InvalidInputError(f"map: cannot extend by {more}, reserve first")
-        self._arrays.anchors[self._count : self._count + more] = anchor
+        self._arrays.anchors[self._count : self._count + more] = self.anchor if anchor is None else anchor
         self._count += more
 
     def append(
@@ -152,9 +157,9 @@ class SurfelMap:
         radii_m: Float32,
         confidences: Float32,
         frame_id: int,
-        anchor: int = 0,
+        anchor: int | None = None,
     ) -> None:
-        """Add surfels: positions, normals, colors (3, M), radii and confidences (M,)."""
+        """Add surfels: positions, normals, colors (3, M), radii and confidences (M,); they move with a keyframe."""
         more = len(radii_m)
         arrays = self.reserve(more)
         new = slice(self._count, self._count + more)
@@ -185,11 +190,19 @@ class SurfelMap:
 
     def apply_correction(self, correction: MapCorrection) -> None:
         """Move the surfels of each named keyframe by its T_new_old."""
-        for keyframe, T in zip(correction.keyframe_ids, correction.T_new_old, strict=True):
-            mine = np.flatnonzero(self.anchors == keyframe)
-            rotation, translation = T[:3, :3], T[:3, 3, None]
-            self._arrays.positions[:, mine] = rotation @ self._arrays.positions[:, mine] + translation
-            self._arrays.normals[:, mine] = rotation @ self._arrays.normals[:, mine]
+        arrays = self._arrays
+        table = np.tile(np.eye(4), (max(int(self.anchors.max(initial=0)), *correction.keyframe_ids, 0) + 1, 1, 1))
+        table[correction.keyframe_ids] = correction.T_new_old
+
+        def body(start: int, stop: int) -> None:
+            for first in range(start, stop, _MOVED_AT_ONCE):
+                some = slice(first, min(first + _MOVED_AT_ONCE, stop))
+                T = table[arrays.anchors[some]]
+                turned = np.einsum("nij,jn->in", T[:, :3, :3], arrays.positions[:, some])
+                arrays.positions[:, some] = turned + T[:, :3, 3].T
+                arrays.normals[:, some] = np.einsum("nij,jn->in", T[:, :3, :3], arrays.normals[:, some])
+
+        run_ranges(self._count, body, grain=_MOVED_AT_ONCE)
 
     def columns(self) -> dict[str, Array]:
         """Return the map as named columns, in the order of the PLY file."""

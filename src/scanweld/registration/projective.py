@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -25,6 +26,15 @@ from scanweld.registration.gauss_newton import (
     spectrum,
     standard_deviation,
 )
+from scanweld.registration.photometric.refinement import (
+    Gates,
+    GeometricSums,
+    Photometry,
+    Refinement,
+    fill_free,
+    refine_observed,
+)
+from scanweld.registration.photometric.residuals import LitPoints, LitTarget, half_grey
 from scanweld.registration.result import FreeDirection, RegistrationResult, Status
 from scanweld.registration.verification import Agreement, check_against_depth, noise_directions
 
@@ -109,28 +119,10 @@ def projective_step(
     """
     chunks = -(-positions_m.shape[1] // kernels.CHUNK)
     partials = np.empty((chunks, kernels.SUMS))
-    transform = T_target_source[:3].astype(np.float32)
-    surface = target.surface.reshape(-1, 8)
-    intrinsics = intrinsics_array(target.camera)
-    height, width = target.camera.shape
-    gate, cosine, robust = np.float32(gate_m), np.float32(config.min_cosine), np.float32(config.robust_sigma)
+    arguments = _kernel_arguments(T_target_source, target, gate_m, config)
 
     def body(start: int, stop: int) -> None:
-        kernels.point_to_plane_sums(
-            start,
-            stop,
-            positions_m,
-            normals,
-            transform,
-            surface,
-            intrinsics,
-            width,
-            height,
-            gate,
-            cosine,
-            robust,
-            partials,
-        )
+        kernels.point_to_plane_sums(start, stop, positions_m, normals, *arguments, partials)
 
     run_ranges(chunks, body)
     sums = partials.sum(axis=0)
@@ -151,6 +143,40 @@ def projective_step(
     )
 
 
+def _kernel_arguments(
+    T_target_source: Float64, target: SurfaceLevel, gate_m: float, config: ProjectiveConfig
+) -> tuple[Any, ...]:
+    """What `kernels.point_to_plane_sums` takes between the points and the sums."""
+    height, width = target.camera.shape
+    return (
+        T_target_source[:3].astype(np.float32), target.surface.reshape(-1, 8), intrinsics_array(target.camera),
+        width, height, np.float32(gate_m), np.float32(config.min_cosine), np.float32(config.robust_sigma),
+    )  # fmt: skip
+
+
+def _shares(
+    end: _Descent, T_target_source: Float64, target: SurfaceLevel, config: ProjectiveConfig, parts: int
+) -> GeometricSums:
+    """Sum the normal equations of contiguous shares of the points of the finest level, each on its own."""
+    bounds = np.linspace(0, end.positions_m.shape[1], parts + 1).astype(np.int64).tolist()
+    sums = np.empty((parts, kernels.SUMS))
+    arguments = _kernel_arguments(T_target_source, target, config.fine_gate_m, config)
+
+    def body(start: int, stop: int) -> None:
+        for part in range(start, stop):
+            share = slice(bounds[part], bounds[part + 1])
+            positions, normals = end.positions_m[:, share].copy(), end.normals[:, share].copy()
+            partials = np.empty((-(-positions.shape[1] // kernels.CHUNK), kernels.SUMS))
+            kernels.point_to_plane_sums(0, len(partials), positions, normals, *arguments, partials)
+            sums[part] = partials.sum(axis=0)
+
+    run_ranges(parts, body)
+    full = np.zeros((parts, 7, 7))
+    rows, columns = np.triu_indices(7)
+    full[:, rows, columns] = full[:, columns, rows] = sums[:, :28]
+    return GeometricSums(full[:, :6, :6], full[:, :6, 6])
+
+
 def align_projective(
     positions_m: Float32,
     normals: Float32,
@@ -158,6 +184,7 @@ def align_projective(
     T_target_source: Float64,
     config: ProjectiveConfig | None = None,
     *,
+    photometry: Photometry | None = None,
     keep_history: bool = False,
 ) -> RegistrationResult:
     """Align source points with a target pyramid from an initial guess.
@@ -167,6 +194,8 @@ def align_projective(
     positions_m, normals : (3, N) float32, source frame, normals towards the viewer
     target : pyramid, finest level first
     T_target_source : (4, 4) initial guess
+    photometry : brightness of both sides; used where it helps (:mod:`.photometric.refinement`), and where it does not,
+        the result is that without it
     keep_history : put the :class:`ProjectiveStep` of every iteration into the result
 
     The answer is checked against the free space of the target (:func:`~.verification.check_against_depth`): a
@@ -189,14 +218,21 @@ def align_projective(
         end = _descend(positions_m, normals, target, start, config, held)
         end.history[:0] = history
     last = end.history[-1]
+    refined = None
+    if photometry is not None and end.parts is not None and last.num_matched >= config.min_points:
+        refined = _refine(end, photometry, target, config)
+    if refined is not None and refined.used:
+        end.T_target_source, end.parts = refined.T_target_source, refined.parts or end.parts
     agreement = check_against_depth(end.positions_m, end.normals, end.T_target_source, target[0])
     overlap = last.num_matched / max(1, end.positions_m.shape[1])
     free = free_directions(last.equations, end.parts) if end.parts is not None and last.num_matched >= 6 else ()
     status, note = _judge(last, overlap, agreement, free, end.converged, len(end.history), config)
+    if refined is not None and refined.parts is not None and status.has_pose:
+        note = f"{note}; {refined.words}" if note else refined.words
     return RegistrationResult(
         T_target_source=end.T_target_source,
         status=status,
-        information=last.equations.information,
+        information=last.equations.information + (refined.information if refined is not None and refined.used else 0.0),
         num_iterations=len(end.history),
         num_inliers=last.num_inliers,
         overlap=overlap,
@@ -224,6 +260,7 @@ class _Descent:
     normals: Float32
     centroid_m: Float64
     radius_m: float
+    stride: int = 1
 
 
 def _descend(
@@ -239,6 +276,7 @@ def _descend(
     end = _Descent(T_target_source, [], None, False, positions_m, normals, np.zeros(3), 1.0)
     for level in range(coarsest, -1, -1):
         stride = max(1, -(-positions_m.shape[1] // max(config.min_points, config.max_points >> (2 * level))))
+        end.stride = stride
         end.positions_m, end.normals = positions_m[:, ::stride].copy(), normals[:, ::stride].copy()
         few = end.positions_m[:, :: max(1, end.positions_m.shape[1] // 1000)]
         end.centroid_m, end.radius_m = _centroid_and_radius(se3.transform_points(end.T_target_source, few.T))
@@ -264,6 +302,27 @@ def _descend(
                 end.converged = True
                 break
     return end
+
+
+def _refine(
+    end: _Descent, photometry: Photometry, target: Sequence[SurfaceLevel], config: ProjectiveConfig
+) -> Refinement:
+    """Let brightness act on the points of the finest level."""
+    points = LitPoints(end.positions_m, end.normals, photometry.intensities[:: end.stride].copy())
+
+    def geometry(T_target_source: Float64, parts: int) -> GeometricSums:
+        return _shares(end, T_target_source, target[0], config, parts)
+
+    gates = Gates(config.fine_gate_m, config.min_cosine)
+    assert end.parts is not None
+    if end.parts.observable.all():
+        lit = LitTarget(target[0], photometry.grey)
+        return refine_observed(end.T_target_source, points, lit, geometry, gates)
+    greys = [photometry.grey]
+    for _ in target[1:]:
+        greys.append(half_grey(greys[-1]))
+    lits = [LitTarget(level, grey) for level, grey in zip(target, greys, strict=True)]
+    return fill_free(end.T_target_source, points, lits, photometry, end.stride, geometry, end.parts, gates)
 
 
 def schedules(config: ProjectiveConfig) -> Iterator[ProjectiveConfig]:

@@ -217,7 +217,7 @@ def summarise(slam: Slam, truth: Trajectory | None, num_points_input: int) -> tu
         "frames_lost": states.count(FrameState.LOST),
         "frames_unreadable": states.count(FrameState.UNREADABLE),
         "relocalisations": states.count(FrameState.RELOCALISED),
-        "loop_closures": 0,
+        "loop_closures": slam.loop_closer.num_closures,
         "ate_rmse_m": error.rmse_m if error else None,
         "ate_max_m": error.max_m if error else None,
         "rpe_trans_m": motion[0],

@@ -10,18 +10,20 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from scanweld.arrays import Float64, as_transform
+from scanweld.arrays import Bool, Float64, as_transform
 from scanweld.config import check_ranges, section, setting
-from scanweld.errors import InvalidInputError
+from scanweld.errors import ConfigError, InvalidInputError
 from scanweld.geometry.camera import PinholeCamera
 from scanweld.geometry.depth import SurfaceConfig, SurfacePyramid, build_pyramid
 from scanweld.geometry.frame import Frame
 from scanweld.geometry.views import MapCorrection, ModelView
-from scanweld.loop_closure.loop_closer import NoLoopCloser
+from scanweld.loop_closure.loop_closer import KeyframeLoopCloser, LoopClosingConfig, NoLoopCloser
 from scanweld.mapping.fusion import FusionConfig
 from scanweld.mapping.mapper import SurfelMapper
-from scanweld.registration.result import RegistrationResult
+from scanweld.registration.result import RegistrationResult, Status
+from scanweld.slam.health import HealthConfig, TrackingHealth, is_near
 from scanweld.slam.motion import POSED, ConstantVelocity, trajectory_of
+from scanweld.tracking.dynamics import DynamicsConfig, MotionDetector, leave_out, track_static
 from scanweld.tracking.tracker import FrameToModelTracker, TrackingConfig
 from scanweld.trajectory import FrameResult, FrameState, Trajectory
 
@@ -46,8 +48,8 @@ class Mapper(Protocol):
         """Return the map as seen from a pose."""
         ...
 
-    def fuse(self, pyramid: SurfacePyramid, T_world_camera: Float64) -> object:
-        """Merge a frame into the map."""
+    def fuse(self, pyramid: SurfacePyramid, T_world_camera: Float64, *, keyframe: int, moving: Bool | None) -> object:
+        """Merge a frame into the map, but for pixels (H, W) that move; what is new is corrected with a keyframe."""
         ...
 
     def apply(self, correction: MapCorrection) -> None:
@@ -56,10 +58,24 @@ class Mapper(Protocol):
 
 
 class LoopCloser(Protocol):
-    """Recognises places and corrects the map."""
+    """Recognises places, finds a lost camera, and corrects the map."""
+
+    @property
+    def keyframe(self) -> int:
+        """The keyframe that new surfels and frames move with."""
+        ...
+
+    @property
+    def num_closures(self) -> int:
+        """Number of loops closed so far."""
+        ...
 
     def process(self, pyramid: SurfacePyramid, result: FrameResult) -> MapCorrection | None:
         """Look at a tracked frame; return a correction when a loop was closed."""
+        ...
+
+    def relocalise(self, pyramid: SurfacePyramid) -> RegistrationResult:
+        """Look for a lost camera; only CONVERGED says that T_target_source is T_world_camera."""
         ...
 
 
@@ -71,13 +87,25 @@ class SlamConfig:
     surfaces: SurfaceConfig = section(SurfaceConfig, "how depth becomes surfaces")
     tracking: TrackingConfig = section(TrackingConfig, "how a frame is aligned with the map")
     fusion: FusionConfig = section(FusionConfig, "how a frame is merged into the map")
+    health: HealthConfig = section(HealthConfig, "when a tracked pose is not believed")
+    dynamics: DynamicsConfig = section(DynamicsConfig, "what counts as moving, and is kept out of the map")
+    loop_closer: str = setting(
+        "keyframes",
+        "keyframes remembers places, finds a lost camera and closes loops; none does without: odometry alone",
+    )
+    loop_closing: LoopClosingConfig = section(LoopClosingConfig, "how places are remembered, and loops closed")
 
     def __post_init__(self) -> None:
         check_ranges(self)
+        if self.loop_closer not in _LOOP_CLOSERS:
+            raise ConfigError(f"loop_closer = {self.loop_closer!r}: expected {' or '.join(_LOOP_CLOSERS)}")
+
+
+_LOOP_CLOSERS = ("keyframes", "none")
 
 
 class Slam:
-    """Dense SLAM whose stages are given, each behind a Protocol.
+    """Dense SLAM whose stages are given, each behind a Protocol; without `dynamics` the scene is taken to stand still.
 
     The world frame is that of the first frame unless `T_world_first` says otherwise.
     """
@@ -89,6 +117,8 @@ class Slam:
         mapper: Mapper,
         loop_closer: LoopCloser | None = None,
         surfaces: SurfaceConfig | None = None,
+        health: HealthConfig | None = None,
+        dynamics: DynamicsConfig | None = None,
         T_world_first: npt.ArrayLike | None = None,
     ) -> None:
         self.tracker = tracker
@@ -96,6 +126,10 @@ class Slam:
         self.loop_closer = loop_closer or NoLoopCloser()
         self.surfaces = surfaces or SurfaceConfig()
         self.results: list[FrameResult] = []
+        self._keyframes: list[int] = []  # that each result moves with
+        self._health = TrackingHealth(health)
+        self._dynamics = MotionDetector(dynamics) if dynamics else None
+        self._moving: Bool | None = None  # pixels of the last frame that was fused
         self._motion = ConstantVelocity()
         self._T_world_first = _near_pose(np.eye(4) if T_world_first is None else T_world_first, "T_world_first")
 
@@ -131,17 +165,25 @@ class Slam:
         elif len(self.mapper.map) == 0:
             result = self._first(pyramid, predicted)
         else:
-            result = self._judged(frame, predicted, self.tracker.track(pyramid, view, predicted))
+            result = self._tracked(pyramid, view, predicted)
         clock.lap("track")
         if result.state is not FrameState.LOST:  # a lost frame is never fused
-            self.mapper.fuse(pyramid, result.T_world_camera)
-            self._motion.observe(frame.timestamp_s, result.T_world_camera)
+            self.mapper.fuse(pyramid, result.T_world_camera, keyframe=self.loop_closer.keyframe, moving=self._moving)
+            if self._dynamics:
+                self._dynamics.remember(pyramid, result.T_world_camera)
+            partly = result.status == Status.DEGENERATE.value
+            self._motion.observe(frame.timestamp_s, result.T_world_camera, partly=partly)
             clock.lap("fuse")
-            correction = self.loop_closer.process(pyramid, result)
+        elif len(self.mapper.map):
+            result = replace(result, T_world_camera=self._motion.miss(frame.timestamp_s))
+        result = self._keep(replace(result, num_surfels=len(self.mapper.map), stage_ms=clock.laps_ms))
+        if result.state is not FrameState.LOST:
+            still = pyramid if self._moving is None else leave_out(pyramid, self._moving)
+            correction = self.loop_closer.process(still, result)
             if correction is not None:
-                self.mapper.apply(correction)
+                self._correct(correction)
             clock.lap("loop")
-        return self._keep(replace(result, num_surfels=len(self.mapper.map), stage_ms=clock.laps_ms))
+        return self.results[-1]
 
     def skip(self, timestamp_s: float, reason: str) -> FrameResult:
         """Note a frame that could not be read; its pose is the motion model's."""
@@ -156,6 +198,60 @@ class Slam:
                 note=reason,
             )
         )
+
+    def _tracked(self, pyramid: SurfacePyramid, view: ModelView, predicted: Float64) -> FrameResult:
+        """Align a frame with the map where it is expected; a lost camera is looked for among the known places, too."""
+        frame, lost_for = pyramid.frame, self._lost_for()
+        moved, self._moving = self._moving, None
+        if lost_for > _SHORT_LOSS:
+            result = self._found_again(pyramid, predicted)
+            if result.state is not FrameState.LOST:
+                return result
+        if self._dynamics:
+            aligned, moving = track_static(self.tracker.track, self._dynamics, pyramid, view, predicted, moved)
+        else:
+            aligned, moving = self.tracker.track(pyramid, view, predicted), None
+        if lost_for > _SHORT_LOSS and not (aligned.status.success and is_near(aligned.T_target_source, predicted)):
+            return result  # the camera may be anywhere: what fits far from the guess fits by chance
+        result = self._judged(frame, predicted, aligned)
+        if result.state is not FrameState.LOST:
+            self._moving = moving
+        if result.state is FrameState.LOST and 0 < lost_for <= _SHORT_LOSS:
+            found = self._found_again(pyramid, predicted)
+            result = found if found.state is not FrameState.LOST else result
+        return result
+
+    def _lost_for(self) -> int:
+        """Number of frames since the camera was last tracked."""
+        return next((n for n, r in enumerate(reversed(self.results)) if r.state in POSED), len(self.results))
+
+    def _found_again(self, pyramid: SurfacePyramid, predicted: Float64) -> FrameResult:
+        """Look for a lost camera among the places that are known, and align it with the map there."""
+        frame = pyramid.frame
+        found = self.loop_closer.relocalise(pyramid)
+        start = found.T_target_source
+        if found.status.success:
+            aligned = self.tracker.track(pyramid, self.mapper.view(start, frame.camera), start)
+        if not (found.status.success and aligned.status.has_pose):
+            return self._judged(frame, predicted, aligned if found.status.success else found)
+        self._health = TrackingHealth(self._health.config)  # what was usual was so elsewhere
+        if self._motion.carried(frame.timestamp_s, start):
+            self._motion.forget()
+        return self._judged(frame, start, aligned)
+
+    def _correct(self, correction: MapCorrection) -> None:
+        """Move the map, the frames so far and the camera with their keyframes."""
+        if self._dynamics:
+            self._dynamics.forget()
+        self.mapper.apply(correction)
+        moved = dict(zip(correction.keyframe_ids.tolist(), correction.T_new_old, strict=True))
+        self.results = [
+            replace(result, T_world_camera=moved[keyframe] @ result.T_world_camera) if keyframe in moved else result
+            for result, keyframe in zip(self.results, self._keyframes, strict=True)
+        ]
+        now = moved.get(self.loop_closer.keyframe)
+        if now is not None:
+            self._motion.move(now)
 
     def _first(self, pyramid: SurfacePyramid, predicted: Float64) -> FrameResult:
         """Start the map, unless there is nothing to start it with."""
@@ -179,8 +275,11 @@ class Slam:
         )
 
     def _judged(self, frame: Frame, predicted: Float64, aligned: RegistrationResult) -> FrameResult:
-        """Turn an alignment into a state: no answer means LOST, and the motion model's pose."""
-        lost = not aligned.status.has_pose
+        """Turn an alignment into a state: no answer, or none to be believed, means LOST and the motion model's pose."""
+        doubt = self._health.doubt(aligned, predicted) if aligned.status.has_pose else ""
+        lost = bool(doubt) or not aligned.status.has_pose
+        if not lost:
+            self._health.observe(aligned, predicted)
         looked_at = (r.state for r in reversed(self.results) if r.state is not FrameState.UNREADABLE)
         was_lost = next(looked_at, None) is FrameState.LOST
         state = FrameState.LOST if lost else FrameState.RELOCALISED if was_lost else FrameState.TRACKING
@@ -189,12 +288,12 @@ class Slam:
             timestamp_s=frame.timestamp_s,
             state=state,
             status=aligned.status.value,
-            T_world_camera=self._motion.miss(frame.timestamp_s) if lost else aligned.T_target_source,
+            T_world_camera=predicted if lost else aligned.T_target_source,
             rmse_m=aligned.rmse_m,
             loss=aligned.loss,
             num_inliers=aligned.num_inliers,
             overlap=aligned.overlap,
-            note=aligned.note,
+            note=doubt or aligned.note,
         )
 
     def _check_time(self, timestamp_s: float) -> None:
@@ -207,8 +306,12 @@ class Slam:
 
     def _keep(self, result: FrameResult) -> FrameResult:
         self.results.append(result)
+        self._keyframes.append(self.loop_closer.keyframe)
         return result
 
+
+_SHORT_LOSS = 2
+"""Frames after which a lost camera may be anywhere: the motion model is asked no longer, the known places are."""
 
 FARTHEST_M = 1e4
 """Largest coordinate of a given pose [m]: maps are float32, which has steps of 1 mm there."""
@@ -250,8 +353,10 @@ def build_slam(camera: PinholeCamera, config: SlamConfig | None = None, **stages
     parts: dict[str, Any] = {
         "tracker": FrameToModelTracker(config.tracking),
         "mapper": SurfelMapper(config.fusion),
-        "loop_closer": NoLoopCloser(),
+        "loop_closer": KeyframeLoopCloser(config.loop_closing) if config.loop_closer == "keyframes" else NoLoopCloser(),
         "surfaces": config.surfaces,
+        "health": config.health,
+        "dynamics": config.dynamics,
     }
     unknown = set(stages) - {*parts, "T_world_first"}
     if unknown:

@@ -6,14 +6,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from scanweld.arrays import Float32, Float64
+from scanweld.arrays import Float32, Float64, Int64
 from scanweld.config import check_ranges, section, setting
+from scanweld.errors import ConfigError
 from scanweld.geometry import se3
 from scanweld.geometry.depth import SurfacePyramid
 from scanweld.geometry.views import ModelView
+from scanweld.registration.photometric.refinement import Photometry
+from scanweld.registration.photometric.residuals import luminance
 from scanweld.registration.projective import ProjectiveConfig, align_projective, schedules
 from scanweld.registration.result import RegistrationResult, Status
-from scanweld.registration.verification import check_against_depth
+from scanweld.registration.verification import Agreement, check_against_depth
+from scanweld.tracking.rotation import RotationPrior, find_turns, thumbnails
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -32,8 +36,19 @@ class TrackingConfig:
         lambda: ProjectiveConfig(min_agreement=0.5, max_conflict=0.12), "schedule and gates of the alignment"
     )
 
+    photometry: bool | str = setting(
+        "auto", "auto (or true): brightness where it helps geometry or replaces it; off (or false): geometry alone"
+    )
+
     def __post_init__(self) -> None:
         check_ranges(self)
+        if self.photometry not in (True, False, "auto", "off"):
+            raise ConfigError(f"photometry = {self.photometry!r}: expected 'auto', 'off', true or false")
+
+    @property
+    def uses_photometry(self) -> bool:
+        """Whether brightness may be used."""
+        return self.photometry in (True, "auto")
 
 
 FAR_TURN_RAD = 0.15
@@ -49,7 +64,14 @@ class FrameToModelTracker:
     def __init__(self, config: TrackingConfig | None = None) -> None:
         self.config = config or TrackingConfig()
 
-    def track(self, pyramid: SurfacePyramid, view: ModelView, T_world_camera: Float64) -> RegistrationResult:
+    def track(
+        self,
+        pyramid: SurfacePyramid,
+        view: ModelView,
+        T_world_camera: Float64,
+        *,
+        rotation_prior: RotationPrior | None = None,
+    ) -> RegistrationResult:
         """Align a frame with the map seen from close by.
 
         Parameters
@@ -57,28 +79,37 @@ class FrameToModelTracker:
         pyramid : the frame
         view : the map as seen from about `T_world_camera`
         T_world_camera : (4, 4), predicted pose
+        rotation_prior : a measured rotation, from a gyroscope say; it takes the place of the predicted one
 
         Returns
         -------
         The result of moving the camera: T_target_source is T_world_camera, and `information` belongs to a left
-        perturbation of it, in world axes. Free directions are named in the camera's axes.
+        perturbation of it, in world axes. Free directions are named in the camera's axes; along these the pose is the
+        predicted one.
         """
-        positions, normals = self._select(view)
+        rows = self._rows(view)
+        scene = _Scene(*_taken(view, rows), pyramid, self._photometry(pyramid, view, rows))
         T_camera_world = se3.inverse(T_world_camera)
+        if rotation_prior is not None:
+            T_camera_world = rotation_prior.turned(T_camera_world)
         first, *wider = schedules(self.config.projective)
-        best = align_projective(positions, normals, pyramid.levels, T_camera_world, first)
-        shift, turn = np.split(se3.log(best.T_target_source @ se3.inverse(T_camera_world)), 2)
-        far = np.linalg.norm(shift) > first.coarse_gate_m or np.linalg.norm(turn) > FAR_TURN_RAD
-        if best.status.has_pose and far:  # the prediction speaks against it, so the depth must speak for it
-            agreement = check_against_depth(positions, normals, best.T_target_source, pyramid.levels[0])
-            if not agreement.fits(wider[0] if wider else first):
+        strict = replace(wider[0], coarse_gate_m=first.coarse_gate_m, min_cosine=first.min_cosine) if wider else first
+        best = scene.align(T_camera_world, first)
+        far = best.status.has_pose and _is_far(best, T_camera_world, first)
+        if far:  # the prediction speaks against it, so the depth must speak for it
+            agreement = scene.agreement(best)
+            if not agreement.fits(strict):
                 best = replace(best, status=Status.NO_OVERLAP, note=f"far from the prediction, and {agreement.words}")
+        if far or not best.status.has_pose:
+            best = self._turned(scene, view, T_camera_world, best, strict)
         if not best.status.has_pose:
             for schedule in wider:
-                result = align_projective(positions, normals, pyramid.levels, T_camera_world, schedule)
+                result = scene.align(T_camera_world, schedule)
                 if result.status is Status.CONVERGED:  # after a wide search nothing less is worth a pose
                     best = result
                     break
+        if rotation_prior is not None and best.status.has_pose:
+            best = rotation_prior.checked(best)
         # The aligner moves the map to the camera: T_cw <- exp(xi) T_cw. With T_wc <- exp(eta) T_wc, xi = -Ad(T_cw) eta.
         adjoint = se3.adjoint(best.T_target_source)
         return replace(
@@ -87,8 +118,41 @@ class FrameToModelTracker:
             information=adjoint.T @ best.information @ adjoint,
         )
 
+    def _turned(
+        self,
+        scene: _Scene,
+        view: ModelView,
+        T_camera_world: Float64,
+        best: RegistrationResult,
+        strict: ProjectiveConfig,
+    ) -> RegistrationResult:
+        """Try again from where small images say the camera has turned to; returns the better answer.
+
+        Two answers are told apart by how much of what both cameras see agrees.
+        """
+        light = scene.photometry
+        if light is None:
+            return best
+        camera = view.camera
+        source = thumbnails(light.pictures[0][0], light.pictures[0][1], camera)
+        target = thumbnails(light.grey, np.ones(light.grey.shape, np.bool_), camera)
+        T_view_world = se3.inverse(view.T_world_camera)
+        for turn in find_turns(source, target):
+            start = T_view_world.copy()
+            start[:3] = turn.rotation @ start[:3]
+            result = scene.align(start, strict)
+            if result.status is not Status.CONVERGED or _is_far(result, start, strict):
+                continue
+            if not best.status.has_pose or scene.agreement(result).agree > scene.agreement(best).agree:
+                return result
+        return best
+
     def _select(self, view: ModelView) -> tuple[Float32, Float32]:
-        """Return the positions and normals (3, M) of the surfels to track against, in the order of the image.
+        """Return the positions and normals (3, M) of the surfels to track against, in the order of the image."""
+        return _taken(view, self._rows(view))
+
+    def _rows(self, view: ModelView) -> Int64 | None:
+        """Choose the rows of the view to track against; None stands for all.
 
         Where half of the view is stable, only stable surfels count: the others are mostly noise. A map that is young or
         new to this place has nothing better than all of them.
@@ -106,6 +170,44 @@ class FrameToModelTracker:
             stable = stable[np.sort(np.concatenate([above, tied[np.arange(more) * len(tied) // more]]))]
         # The aligner reads no more than this: an even share of the image, before anything is copied.
         stable = stable[:: max(1, -(-len(stable) // self.config.projective.max_points))]
-        if len(stable) == len(view):
-            return view.positions_m, view.normals
-        return np.take(view.positions_m, stable, axis=1), np.take(view.normals, stable, axis=1)
+        return None if len(stable) == len(view) else stable
+
+    def _photometry(self, pyramid: SurfacePyramid, view: ModelView, rows: Int64 | None) -> Photometry | None:
+        """Return the brightness of both sides where there is any and it is wanted."""
+        color = pyramid.frame.color
+        if not self.config.uses_photometry or color is None or view.intensities is None:
+            return None
+        chosen = view.intensities if rows is None else view.intensities[rows]
+        return Photometry(chosen, luminance(color), view.index_map, view.intensities, rows)
+
+
+@dataclass(frozen=True, slots=True)
+class _Scene:
+    """What is aligned: surfels (3, M), world frame, and a frame."""
+
+    positions_m: Float32
+    normals: Float32
+    pyramid: SurfacePyramid
+    photometry: Photometry | None
+
+    def align(self, T_camera_world: Float64, config: ProjectiveConfig) -> RegistrationResult:
+        """Align from a start."""
+        return align_projective(
+            self.positions_m, self.normals, self.pyramid.levels, T_camera_world, config, photometry=self.photometry
+        )
+
+    def agreement(self, result: RegistrationResult) -> Agreement:
+        """Compare an answer with the depth."""
+        return check_against_depth(self.positions_m, self.normals, result.T_target_source, self.pyramid.levels[0])
+
+
+def _is_far(result: RegistrationResult, T_target_source: Float64, config: ProjectiveConfig) -> bool:
+    """Whether an answer is far from where it was expected."""
+    shift, turn = np.split(se3.log(result.T_target_source @ se3.inverse(T_target_source)), 2)
+    return bool(np.linalg.norm(shift) > config.coarse_gate_m or np.linalg.norm(turn) > FAR_TURN_RAD)
+
+
+def _taken(view: ModelView, rows: Int64 | None) -> tuple[Float32, Float32]:
+    if rows is None:
+        return view.positions_m, view.normals
+    return np.take(view.positions_m, rows, axis=1), np.take(view.normals, rows, axis=1)

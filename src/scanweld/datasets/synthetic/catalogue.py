@@ -8,9 +8,16 @@ from functools import lru_cache
 from scanweld.datasets.synthetic.corridor import build_corridor
 from scanweld.datasets.synthetic.rooms import build_room
 from scanweld.datasets.synthetic.scene import Scene
+from scanweld.datasets.synthetic.twin_rooms import build_twin_rooms
+from scanweld.datasets.synthetic.wall import build_wall
 from scanweld.errors import ConfigError
 
-SCENES: dict[str, Callable[[int], Scene]] = {"room": build_room, "corridor": build_corridor}
+SCENES: dict[str, Callable[[int], Scene]] = {
+    "room": build_room,
+    "corridor": build_corridor,
+    "twin-rooms": build_twin_rooms,
+    "wall": build_wall,
+}
 """Builders of the scenes by name; they take a seed."""
 
 

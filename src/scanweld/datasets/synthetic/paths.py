@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from scanweld.arrays import Float64
-from scanweld.datasets.synthetic import corridor
+from scanweld.datasets.synthetic import corridor, twin_rooms, wall
 from scanweld.errors import ConfigError, InvalidInputError
 from scanweld.geometry import se3
 from scanweld.trajectory import Trajectory
@@ -61,10 +61,33 @@ def _loop(phase: Float64) -> View:
     return position, heading + np.deg2rad(11) * np.sin(7 * phase), np.deg2rad(-9 + 4 * np.sin(5 * phase))
 
 
+def _visit(phase: Float64) -> View:
+    """Around both of the twin rooms and twice through their corridor; half a round later all looks the same."""
+    xz, heading = twin_rooms.centre_line(phase)
+    position = np.insert(xz, 1, 1.36 + 0.04 * np.sin(8 * phase), axis=-1)
+    return position, heading + np.deg2rad(4) * np.sin(6 * phase), np.deg2rad(-9 + 4 * np.sin(4 * phase))
+
+
+def _along(phase: Float64) -> View:
+    """There and back along the plain wall, looking straight at it."""
+    x, z = -2.05 * np.cos(phase), wall.WIDTH / 2 - wall.DISTANCE - 0.2 * np.sin(phase)
+    position = np.stack([x, 1.35 + 0.03 * np.sin(3 * phase), z], axis=-1)
+    return position, np.deg2rad(2) * np.sin(2 * phase), np.deg2rad(1.5) * np.sin(3 * phase)
+
+
+def _along_bricks(phase: Float64) -> View:
+    """The same along the brick wall."""
+    position, yaw, pitch = _along(phase)
+    return position * np.array([1.0, 1.0, -1.0]), np.pi - yaw, pitch
+
+
 PATHS = {
     "orbit": BuiltInPath("room", _orbit, 0.6),
     "sweep": BuiltInPath("room", _sweep, 0.3),
     "loop": BuiltInPath("corridor", _loop, 0.7),
+    "visit": BuiltInPath("twin-rooms", _visit, 0.45),
+    "plain": BuiltInPath("wall", _along, 0.5),
+    "brick": BuiltInPath("wall", _along_bricks, 0.5),
 }
 """Built-in paths by name; the first of a scene is its default."""
 

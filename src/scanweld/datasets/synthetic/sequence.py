@@ -38,10 +38,11 @@ class RenderConfig:
         When a value is out of range or a name is unknown.
     """
 
-    scene: str = setting("room", "Scene: 'room' or 'corridor' (a loop of rooms, 34 m around).")
+    scene: str = setting("room", "Scene: 'room', 'corridor' (a loop of rooms, 34 m around), 'twin-rooms' or 'wall'.")
     path: str = setting(
         "",
-        "Camera path: built in (room: orbit, sweep; corridor: loop) or a trajectory file; '': the first.",
+        "Camera path: built in (room: orbit, sweep; corridor: loop; twin-rooms: visit; wall: plain, brick) or a "
+        "trajectory file; '': the scene's first.",
     )
     path_frame: str = setting("cv", "Axes of a trajectory file: 'cv' (y down), or 'icl' (ICL-NUIM, y up, fy = -480).")
     noise: str = setting("none", "Depth camera: 'none' (exact), 'kinect' or 'realsense'.")
@@ -80,6 +81,8 @@ class SyntheticSequence:
     Parameters
     ----------
     config : what to render; the default is the furnished room
+    trajectory : the poses to render, where neither a built-in path nor a file has them; `config` then has no path,
+        no number of frames, and its rate is not used
 
     Attributes
     ----------
@@ -90,13 +93,18 @@ class SyntheticSequence:
     Raises
     ------
     ConfigError, FileFormatError, InvalidInputError
-        When the path is unknown, cannot be read, or is too short.
+        When the path is unknown, cannot be read, or is too short, or poses are given beside a path.
     """
 
-    def __init__(self, config: RenderConfig | None = None) -> None:
+    def __init__(self, config: RenderConfig | None = None, *, trajectory: Trajectory | None = None) -> None:
         self.config = config or RenderConfig()
         c = self.config
-        self.path_name, self._trajectory = choose_path(c.scene, c.path, c.path_frame, c.frames, c.fps)
+        if trajectory is None:
+            self.path_name, self._trajectory = choose_path(c.scene, c.path, c.path_frame, c.frames, c.fps)
+        elif c.path or c.frames:
+            raise ConfigError(f"path = '{c.path}', frames = {c.frames}: leave both out where the poses are given")
+        else:
+            self.path_name, self._trajectory = "given", trajectory
         self.name = f"{c.scene}-{self.path_name}" + ("" if c.noise == "none" else f"-{c.noise}")
         self.camera = c.camera()
         self.depth_scale = DEPTH_SCALE

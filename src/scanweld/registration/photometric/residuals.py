@@ -6,7 +6,7 @@ an offset: r = gain I_model + offset - I(pi(p)) (Steinbruecker et al. 2011; affi
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -18,8 +18,11 @@ from scanweld.registration.photometric import kernels
 FREEDOM = 5.0
 """Degrees of freedom of Student's t, as Kerl et al. 2013 measured for photometric residuals."""
 
-SCALE_SAMPLES = 4000
+SCALE_SAMPLES = 1200
 """Points that the scale and the brightness are estimated from."""
+
+MIN_SAMPLES = 50
+"""With fewer of them seen there is no estimate."""
 
 MIN_SCALE = 0.5
 """Smallest scale of the residuals [grey levels]: rounding alone gives 0.3."""
@@ -84,8 +87,9 @@ class PhotometricSums:
 def luminance(color: UInt8) -> Float32:
     """Return the grey image (H, W) float32, 0..255, of a colour image (H, W, 3) uint8."""
     color = as_kernel_input(color, np.uint8)
-    grey = np.empty(color.shape[:2], np.float32)
-    run_ranges(grey.shape[0], lambda start, stop: kernels.luminance_rows(start, stop, color, grey))
+    height, width = color.shape[0], color.shape[1]
+    grey = np.empty((height, width), np.float32)
+    run_ranges(height, lambda start, stop: kernels.luminance_rows(start, stop, color, grey))
     return grey
 
 
@@ -138,6 +142,7 @@ class PhotometricRows:
     residuals : (M,) [grey levels]
     seen : (N,) bool, the M points that count
     model, frame : (M,) intensities
+    points_m : (M, 3), target frame
     """
 
     jacobian: Float64
@@ -145,6 +150,7 @@ class PhotometricRows:
     seen: Bool
     model: Float64
     frame: Float64
+    points_m: Float64
 
 
 def reference_rows(
@@ -170,34 +176,31 @@ def reference_rows(
     column, row = np.floor(u).astype(np.int64), np.floor(v).astype(np.int64)
     e, f = u - column, v - row
     corners = [[grey[row + j, column + i] for i in (0, 1)] for j in (0, 1)]
-    frame = (1 - f) * ((1 - e) * corners[0][0] + e * corners[0][1]) + f * (
-        (1 - e) * corners[1][0] + e * corners[1][1]
-    )
+    frame = (1 - f) * ((1 - e) * corners[0][0] + e * corners[0][1]) + f * ((1 - e) * corners[1][0] + e * corners[1][1])
     slope_u = (1 - f) * (corners[0][1] - corners[0][0]) + f * (corners[1][1] - corners[1][0])
     slope_v = (1 - e) * (corners[1][0] - corners[0][0]) + e * (corners[1][1] - corners[0][1])
     d = np.zeros_like(p)
     d[:, 0], d[:, 1] = -slope_u * camera.fx / p[:, 2], -slope_v * camera.fy / p[:, 2]
     d[:, 2] = -(d[:, 0] * p[:, 0] + d[:, 1] * p[:, 1]) / p[:, 2]
     jacobian = np.concatenate([d, np.cross(p, d), model[:, None], np.ones((len(p), 1))], axis=1)
-    return PhotometricRows(jacobian, brightness.gain * model + brightness.offset - frame, seen, model, frame)
+    return PhotometricRows(jacobian, brightness.gain * model + brightness.offset - frame, seen, model, frame, p)
 
 
 def estimate_brightness(
     points: LitPoints, target: LitTarget, T_target_source: Float64, gate_m: float, min_cosine: float
-) -> tuple[Brightness, int]:
+) -> Brightness | None:
     """Fit gain, offset and the scale of the residuals at a pose, from a sample of the points.
 
-    Robust regression with Student's t and the median absolute deviation as the scale; returns the number of samples,
-    too.
+    Robust regression with Student's t and the median absolute deviation as the scale; None where too little is seen.
     """
     few = points.every(max(1, len(points) // SCALE_SAMPLES))
     rows = reference_rows(few, target, T_target_source, Brightness(), gate_m, min_cosine)
     model, frame = rows.model, rows.frame
-    if len(model) < 2:
-        return Brightness(), len(model)
+    if len(model) < MIN_SAMPLES:
+        return None
     gain, offset = 1.0, float(np.median(frame - model))
     scale = MIN_SCALE
-    for _ in range(5):
+    for _ in range(4):
         residuals = gain * model + offset - frame
         scale = max(MIN_SCALE, 1.4826 * float(np.median(np.abs(residuals - np.median(residuals)))))
         weights = (FREEDOM + 1) / (FREEDOM + (residuals / scale) ** 2) / scale**2
@@ -206,16 +209,57 @@ def estimate_brightness(
         spread = weights @ (model - mean_model) ** 2 + 1 / GAIN_STD**2
         gain = float((weights @ ((model - mean_model) * (frame - mean_frame)) + 1 / GAIN_STD**2) / spread)
         offset = float(mean_frame - gain * mean_model)
-    return Brightness(gain, offset, scale), len(model)
+    return Brightness(gain, offset, scale)
 
 
-def eliminate_brightness(sums: PhotometricSums, brightness: Brightness) -> tuple[Float64, Float64]:
-    """Remove gain and offset from the sums by the Schur complement.
+@dataclass(frozen=True, slots=True)
+class Eliminated:
+    """Normal equations of the motion alone: gain and offset follow it.
 
-    Returns the information (6, 6) of all parts and the scores (K, 6) of each, which add up to the gradient.
+    Attributes
+    ----------
+    information : (6, 6), Schur complement of the brightness
+    scores : (K, 6), of each part; they add up to the gradient
+    brightness : where the sums were formed
     """
+
+    information: Float64
+    scores: Float64
+    brightness: Brightness
+    sums: PhotometricSums
+    mix: Float64
+    corner: Float64
+    pull: Float64
+
+    @property
+    def gradient(self) -> Float64:
+        """(6,)."""
+        return np.asarray(self.scores.sum(axis=0))
+
+    def scores_at(self, x: Float64) -> Float64:
+        """Return the scores (K, 6) that are left after a step x (6,) and the brightness that belongs to it."""
+        left = self.sums.gradient + self.sums.information @ np.concatenate([x, self._rise(x)])
+        return np.asarray(left[:, :6] - left[:, 6:] @ self.mix.T)
+
+    def brightness_at(self, x: Float64) -> Brightness:
+        """Return the brightness that belongs to a step x (6,) of the motion."""
+        gain, offset = self._rise(x)
+        return replace(
+            self.brightness, gain=self.brightness.gain + float(gain), offset=self.brightness.offset + float(offset)
+        )
+
+    def _rise(self, x: Float64) -> Float64:
+        """Solve for the steps of gain and offset."""
+        gradient = self.sums.gradient[:, 6:].sum(axis=0) + self.pull
+        slope = self.sums.information[:, 6:, :6].sum(axis=0)
+        return np.asarray(-np.linalg.solve(self.corner, gradient + slope @ x))
+
+
+def eliminate_brightness(sums: PhotometricSums, brightness: Brightness) -> Eliminated:
+    """Remove gain and offset from the sums by the Schur complement."""
     H, g = sums.information.sum(axis=0), sums.gradient
     corner = H[6:, 6:] + np.diag([1 / GAIN_STD**2, 1e-9])
-    pull = np.array([(brightness.gain - 1) / GAIN_STD**2, 0.0]) / len(g)
+    pull = np.array([(brightness.gain - 1) / GAIN_STD**2, 0.0])
     mix = np.linalg.solve(corner, H[6:, :6]).T
-    return H[:6, :6] - mix @ H[6:, :6], g[:, :6] - (g[:, 6:] + pull) @ mix.T
+    scores = g[:, :6] - (g[:, 6:] + pull / len(g)) @ mix.T
+    return Eliminated(H[:6, :6] - mix @ H[6:, :6], scores, brightness, sums, mix, corner, pull)
