@@ -21,11 +21,14 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from scanweld.errors import InvalidInputError
 
 PACKAGE = Path(__file__).parent
+
+_One = TypeVar("_One")
+_Other = TypeVar("_Other")
 
 
 def _kernel_cache_folder() -> Path:
@@ -161,3 +164,20 @@ def _forget_pool() -> None:
 
 if hasattr(os, "register_at_fork"):  # threads do not survive a fork: a child would wait for its parent's
     os.register_at_fork(after_in_child=_forget_pool)
+
+
+def side_by_side(one: Callable[[], _One], other: Callable[[], _Other]) -> tuple[_One, _Other]:
+    """Call both, which must not depend on each other; two threads take one each, others take turns.
+
+    For two things of about the same length this spares two threads waiting for each other; more threads share each.
+    """
+    if get_num_threads() != 2:
+        return one(), other()
+    results: list[Any] = [None, None]
+
+    def body(start: int, stop: int) -> None:
+        with limited_threads(1):
+            results[start:stop] = [call() for call in (one, other)[start:stop]]
+
+    run_ranges(2, body)
+    return results[0], results[1]

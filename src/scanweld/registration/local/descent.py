@@ -78,16 +78,19 @@ def _tightened(problem: Problem, end: Descent) -> Problem:
 
 
 def _coarse_levels(problem: Problem, config: IcpConfig) -> list[Problem]:
-    """Parts of the source, coarsest first; each is an eighth of the next."""
+    """Parts of the source, coarsest first; each is an eighth of the next.
+
+    Only the coarsest, which finds the valley, gets normals of the source: fitting them takes longer than its steps.
+    """
     count = len(problem.source)
     if not config.coarse_to_fine or count < _COARSE_FROM:
         return []
     ratio = count / _COARSEST
-    stride = max(1, round(ratio / _LEVEL_RATIO ** int(np.log(max(ratio, 1)) / np.log(_LEVEL_RATIO))))
-    levels = [problem.coarse(stride, neighbours_of(config, count, problem.dimension))]
-    while len(levels[0].source) >= _LEVEL_RATIO * _COARSEST:
-        levels.insert(0, levels[0].coarse(_LEVEL_RATIO, config.neighbours))
-    return levels
+    strides = [max(1, round(ratio / _LEVEL_RATIO ** int(np.log(max(ratio, 1)) / np.log(_LEVEL_RATIO))))]
+    while count // strides[0] >= _LEVEL_RATIO * _COARSEST:
+        strides.insert(0, strides[0] * _LEVEL_RATIO)
+    neighbours = neighbours_of(config, count, problem.dimension)
+    return [problem.coarse(stride, neighbours, fit=stride == strides[0]) for stride in strides]
 
 
 def iterate(

@@ -9,6 +9,7 @@ import numpy as np
 from scanweld.arrays import Float64, Int64
 from scanweld.geometry import se3
 from scanweld.geometry.normals import SurfaceFit
+from scanweld.parallel import side_by_side
 from scanweld.registration.closed_form import RANK_TOLERANCE
 from scanweld.registration.gauss_newton import (
     NormalEquations,
@@ -16,7 +17,6 @@ from scanweld.registration.gauss_newton import (
     free_directions,
     moved_origin,
     solve,
-    standard_deviation,
 )
 from scanweld.registration.local import kernels
 from scanweld.registration.local.config import IcpConfig, kernel_of
@@ -36,7 +36,6 @@ from scanweld.registration.residuals import normal_equations, point_to_plane
 from scanweld.registration.result import FreeDirection, RegistrationResult, Status
 from scanweld.registration.robust import Cauchy, mad_scale
 
-_SURELY = 3.0  # standard deviations
 _PULLED, _PULLED_POINTS = 0.25, 0.4  # spacings; pairs of points show the sampling
 _SHARED = 0.7  # different targets per pair, below which the sharing is worth a word
 
@@ -222,8 +221,7 @@ def _pull(problem: Problem, config: IcpConfig, evidence: Evidence) -> str:
     """Say how far an answer is from where the surfaces want it, or "" where that is near.
 
     Points beyond the rim of the target pull on point-to-point, and on the others from afar; small steps do not tell.
-    Right answers are within a tenth of a spacing of what point-to-plane would answer, of point-to-point within a third,
-    or as near as the sample can tell.
+    Right answers are within a tenth of a spacing of what point-to-plane would answer, of point-to-point within a third.
     """
     if config.method == "coloured" or problem.prior is not None or problem.uneven:  # the spacing says nothing there
         return ""
@@ -232,8 +230,7 @@ def _pull(problem: Problem, config: IcpConfig, evidence: Evidence) -> str:
     equations, parts = _sliding(problem, evidence)
     asked = float(np.linalg.norm(np.linalg.lstsq(parts.basis, solve(equations, parts), rcond=None)[0]))
     least = (_PULLED_POINTS if config.method == "point-to-point" else _PULLED) * problem.spacing
-    known_to = mad_scale(_surface_rows(problem, evidence)[0]) * standard_deviation(equations, parts)
-    if asked <= max(least, _SURELY * known_to):
+    if asked <= least:
         return ""
     return (
         f"the surfaces do not meet: point-to-plane would move on by {asked:.3g} m or more, as where points beyond the "
@@ -275,9 +272,12 @@ def _statistics(
         weight = kernel.compiled(sample / noise.geometric)
         H = data.T @ sums.similarity[0] @ data
         bread = data @ np.linalg.pinv(H, hermitian=True) @ data.T
-        change = slope(problem, metric, pairs, motion, noise, weight, sample)
+        change, scores = side_by_side(
+            lambda: slope(problem, metric, pairs, motion, noise, weight, sample),
+            lambda: scatter(problem, metric, pairs, motion, noise, weight, bread),
+        )
         A = back @ softened(H, data.T @ change @ data) @ back.T
-        B = back @ data.T @ scatter(problem, metric, pairs, motion, noise, weight, bread) @ data @ back.T
+        B = back @ data.T @ scores @ data @ back.T
     if problem.prior is not None:
         A, B = A.copy(), B.copy()
         A[:6, :6] += noise.geometric**2 * problem.prior.information

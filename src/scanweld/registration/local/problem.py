@@ -5,9 +5,7 @@ Inside, everything is three-dimensional: a problem of the plane has z = 0, and i
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -18,7 +16,7 @@ from scanweld.geometry import se3
 from scanweld.geometry.neighbours import KdTree, NeighbourIndex, build_index
 from scanweld.geometry.normals import fit_surfaces
 from scanweld.geometry.point_cloud import PointCloud, grid_order, median_spacing, voxel_downsample_each
-from scanweld.parallel import get_num_threads, limited_threads, run_ranges
+from scanweld.parallel import side_by_side
 from scanweld.registration.gauss_newton import NormalEquations, free_directions, moved_origin, spectrum
 from scanweld.registration.local.colour import intensity, intensity_gradients
 from scanweld.registration.local.config import IcpConfig
@@ -42,8 +40,6 @@ PLANE = np.array([0, 1, 5])
 """The entries of a twist of space (x, y, z, rx, ry, rz) that move a plane z = 0 within itself."""
 
 _OUT_OF_PLANE = (2, 3, 4)
-_One = TypeVar("_One")
-_Other = TypeVar("_Other")
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,15 +158,16 @@ class Problem:
         """Points (N, 3) as the index takes them."""
         return np.ascontiguousarray(points[:, : self.dimension])
 
-    def coarse(self, stride: int, neighbours: int) -> Problem:
-        """The same problem with every `stride`-th point of the source, with normals on both sides."""
+    def coarse(self, stride: int, neighbours: int, *, fit: bool = True) -> Problem:
+        """The same problem with every `stride`-th point of the source; `fit` gives it normals where it has none."""
         part = slice(None, None, stride)
         source = np.ascontiguousarray(self.source[part])
         source_normals = np.ascontiguousarray(self.source_normals[part])
-        if len(self.normals) and not len(source_normals):
+        if fit and len(self.normals) and not len(source_normals):
             cloud = self.in_dimension(self.source)
-            fit = fit_surfaces(cloud, at=self.in_dimension(source), index=build_index(cloud), neighbours=neighbours)
-            source_normals = _embedded(fit.normals)
+            at = self.in_dimension(source)
+            surfaces = fit_surfaces(cloud, at=at, index=build_index(cloud), neighbours=neighbours)
+            source_normals = _embedded(surfaces.normals)
         return replace(
             self,
             source=source,
@@ -241,11 +238,14 @@ def prepare_problem(
         a, rows_a, source, w = a[order_a], rows_a[order_a], source.select(order_a), w[order_a] if len(w) else w
     if order_b is not None:
         b, rows_b, target = b[order_b], rows_b[order_b], target.select(order_b)
-    look, source_normals = _side_by_side(
+    calls = (
         lambda: _look_at(b, target.normals, config),
         lambda: _normals_of_source(a, source.normals, config),
-        alike=config.needs_source_normals and source.normals is None and target.normals is None,
     )
+    if config.needs_source_normals and source.normals is None and target.normals is None:
+        look, source_normals = side_by_side(*calls)
+    else:
+        look, source_normals = calls[0](), calls[1]()
     if config.needs_normals and not look.normals.any():
         words = "the target's points lie on a line or in one place and have no normals; try point-to-point"
         return _nothing(T0, d, Status.DEGENERATE, words, dropped)
@@ -340,8 +340,10 @@ class _Look:
 
 def _look_at(points: Float64, normals: Float64 | None, config: IcpConfig) -> _Look:
     index = build_index(points)
-    spacing = median_spacing(points, index=index)
-    surfaces = has_surfaces(points, points[:: max(1, len(points) // _SURFACE_SAMPLE)], index)
+    places = points[:: max(1, len(points) // _SURFACE_SAMPLE)]
+    spacing, surfaces = side_by_side(
+        lambda: median_spacing(points, index=index), lambda: has_surfaces(points, places, index)
+    )
     if not config.needs_normals:
         return _Look(index, spacing, surfaces, np.zeros((0, points.shape[1])), 0.0, np.zeros(0))
     # Given normals: a sample tells how noisy they may be.
@@ -360,21 +362,6 @@ def _normals_of_source(points: Float64, normals: Float64 | None, config: IcpConf
     if normals is not None:
         return _unit(normals)
     return fit_surfaces(points, index=build_index(points), neighbours=neighbours_of(config, *points.shape)).normals
-
-
-def _side_by_side(one: Callable[[], _One], other: Callable[[], _Other], alike: bool) -> tuple[_One, _Other]:
-    """Call both. Where they are `alike` in length, two threads take one each, which spares them waiting for each other;
-    more threads share each."""
-    if not alike or get_num_threads() != 2:
-        return one(), other()
-    results: list[Any] = [None, None]
-
-    def body(start: int, stop: int) -> None:
-        with limited_threads(1):
-            results[start:stop] = [call() for call in (one, other)[start:stop]]
-
-    run_ranges(2, body)
-    return results[0], results[1]
 
 
 def _centred_prior(prior: MotionPrior, center_a: Float64, center_b: Float64) -> MotionPrior:
