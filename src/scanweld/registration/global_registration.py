@@ -46,7 +46,7 @@ _KEPT = 0.7  # share of the evidence that must be left after the refinement
 _ASTRAY = 3.0  # voxels that the refinement may move the source, on average
 _MEETING = 300.0  # points of mean weight that meet are worth one feature
 _BLIND = 3.0  # times as much evidence is needed where free space says nothing
-_RIVAL = 0.5  # share of the best evidence that makes another motion as good
+_RIVAL = 0.6  # share of the best evidence that makes another motion as good
 _DIFFERENT = 5.0  # voxels between two motions, on average, that make them two
 
 
