@@ -154,6 +154,16 @@ def test_an_unknown_place_stays_lost() -> None:
     assert {result.state for result in slam.results[24:]} == {FrameState.LOST}
 
 
+def test_given_poses_are_not_corrected() -> None:
+    frames, true = sequence()
+    slam = sw.build_slam(CAMERA, sw.SlamConfig(loop_closing=DENSE))
+    given = drifting(true, np.array([0.006, 0.003, -0.004, 0.0, 0.003, 0.002]))
+    for frame, T in zip(frames, given, strict=True):
+        slam.process(frame, T_world_camera=T)
+    np.testing.assert_allclose(slam.trajectory.T_world_camera, given, atol=1e-12)
+    assert slam.loop_closer.num_closures == 0
+
+
 def test_none_does_without() -> None:
     slam = sw.build_slam(CAMERA, sw.SlamConfig(loop_closer="none"))
     assert isinstance(slam.loop_closer, sw.NoLoopCloser)

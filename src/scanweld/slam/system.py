@@ -177,7 +177,7 @@ class Slam:
         elif len(self.mapper.map):
             result = replace(result, T_world_camera=self._motion.miss(frame.timestamp_s))
         result = self._keep(replace(result, num_surfels=len(self.mapper.map), stage_ms=clock.laps_ms))
-        if result.state is not FrameState.LOST:
+        if result.state is not FrameState.LOST and T_world_camera is None:  # what was given is not corrected
             still = pyramid if self._moving is None else leave_out(pyramid, self._moving)
             correction = self.loop_closer.process(still, result)
             if correction is not None:
