@@ -146,7 +146,9 @@ def test_a_redwood_header_in_the_wrong_place(tmp_path: Path) -> None:
         read_trajectory(tmp_path / "bad.log")
 
 
-@pytest.mark.parametrize("content", [b"\x1f\x8b\x08\x00rubbish", gzip.compress(b"0 0 0 0 0 0 0 1\n" * 99, mtime=0)[:-9]])
+@pytest.mark.parametrize(
+    "content", [b"\x1f\x8b\x08\x00rubbish", gzip.compress(b"0 0 0 0 0 0 0 1\n" * 99, mtime=0)[:-9]]
+)
 def test_damaged_gzip(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "t.gz").write_bytes(content)
     with pytest.raises(FileFormatError, match=r"t[.]gz: cannot be read"):
