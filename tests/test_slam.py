@@ -271,6 +271,18 @@ class TestReplacedStages:
         assert (last.rmse_m, last.overlap, last.num_inliers) == (0.5, 0.25, 7)
         assert slam.trajectory.T_world_camera[3, 0, 3] == (3 if tracked else 0)
 
+    def test_what_moved_in_a_tracked_frame_is_not_cut_out_of_a_placed_one(self) -> None:
+        frames = rendered(count=40).frames[:3]
+        mapper, cut = FakeMapper(), []
+        fuse = mapper.fuse
+        mapper.fuse = lambda *args, **kept: (cut.append(kept["moving"]), fuse(*args, **kept))  # type: ignore[method-assign]
+        slam = Slam(tracker=FakeTracker(sw.Status.CONVERGED), mapper=mapper, loop_closer=FakeLoopCloser())
+        slam.process(frames[0])
+        slam._moving = np.ones(CAMERA.shape, np.bool_)
+        slam.process(frames[1], T_world_camera=np.eye(4))
+        slam.process(frames[2])
+        assert cut == [None, None, None]
+
     def test_build_slam_takes_stages_and_names_a_wrong_one(self) -> None:
         tracker = FakeTracker(sw.Status.CONVERGED)
         assert sw.build_slam(CAMERA, tracker=tracker).tracker is tracker

@@ -129,7 +129,7 @@ class Slam:
         self._keyframes: list[int] = []  # that each result moves with
         self._health = TrackingHealth(health)
         self._dynamics = MotionDetector(dynamics) if dynamics else None
-        self._moving: Bool | None = None  # pixels of the last frame that was fused
+        self._moving: Bool | None = None  # pixels (H, W) that move in the frame at hand
         self._motion = ConstantVelocity()
         self._T_world_first = _near_pose(np.eye(4) if T_world_first is None else T_world_first, "T_world_first")
 
@@ -160,12 +160,13 @@ class Slam:
         predicted = self._motion.predict(frame.timestamp_s) if T_world_camera is None else T_world_camera
         view = self.mapper.view(predicted, frame.camera)
         clock.lap("view")
+        moved, self._moving = self._moving, None
         if T_world_camera is not None:
             result = self._placed(frame, T_world_camera)
         elif len(self.mapper.map) == 0:
             result = self._first(pyramid, predicted)
         else:
-            result = self._tracked(pyramid, view, predicted)
+            result = self._tracked(pyramid, view, predicted, moved)
         clock.lap("track")
         if result.state is not FrameState.LOST:  # a lost frame is never fused
             self.mapper.fuse(pyramid, result.T_world_camera, keyframe=self.loop_closer.keyframe, moving=self._moving)
@@ -199,10 +200,12 @@ class Slam:
             )
         )
 
-    def _tracked(self, pyramid: SurfacePyramid, view: ModelView, predicted: Float64) -> FrameResult:
-        """Align a frame with the map where it is expected; a lost camera is looked for among the known places, too."""
+    def _tracked(self, pyramid: SurfacePyramid, view: ModelView, predicted: Float64, moved: Bool | None) -> FrameResult:
+        """Align a frame with the map where it is expected; a lost camera is looked for among the known places, too.
+
+        `moved` : pixels (H, W) that moved in the frame before, or None.
+        """
         frame, lost_for = pyramid.frame, self._lost_for()
-        moved, self._moving = self._moving, None
         if lost_for > _SHORT_LOSS:
             result = self._found_again(pyramid, predicted)
             if result.state is not FrameState.LOST:
