@@ -8,10 +8,11 @@ from functools import lru_cache
 import numpy as np
 
 from scanweld.arrays import Bool, Float32, Float64, Int32, Int64, UInt8
-from scanweld.config import check_ranges, setting
+from scanweld.config import check_ranges, section, setting
 from scanweld.geometry.camera import PinholeCamera
 from scanweld.geometry.depth import SurfacePyramid, as_kernel_input, intrinsics_array
 from scanweld.mapping import kernels
+from scanweld.mapping.merging import MergingConfig
 from scanweld.mapping.rendering import Candidates, render_index_map
 from scanweld.mapping.surfel_map import SurfelMap
 from scanweld.parallel import run_ranges
@@ -43,6 +44,7 @@ class FusionConfig:
     free_space_margin_m: float = setting(
         0.05, "a surfel this far in front of what is seen through it loses confidence [m]", low=0.0
     )
+    merging: MergingConfig = section(MergingConfig, "which layers become one surface when a loop is closed")
     clean_interval: int = setting(8, "frames between removals; lower saves memory, costs time", low=1)
 
     def __post_init__(self) -> None:

@@ -10,6 +10,7 @@ from scanweld.geometry.camera import PinholeCamera
 from scanweld.geometry.depth import SurfacePyramid
 from scanweld.geometry.views import MapCorrection, ModelView
 from scanweld.mapping.fusion import FusionConfig, FusionCounts, fuse
+from scanweld.mapping.merging import merge_doubled
 from scanweld.mapping.rendering import VIEW_MARGIN_PIXELS, Candidates, find_candidates, render_model_view
 from scanweld.mapping.surfel_map import SurfelMap
 
@@ -56,8 +57,9 @@ class SurfelMapper:
         return counts
 
     def apply(self, correction: MapCorrection) -> None:
-        """Move surfels with their keyframes."""
+        """Move surfels with their keyframes, and fuse the layers that this brings together."""
         self.map.apply_correction(correction)
+        merge_doubled(self.map, self.config.max_confidence, self.config.merging)
         self._candidates = self._index_map = None
 
     def _moved_pixels(self, T_world_camera: Float64, camera: PinholeCamera, depth_m: float) -> float:

@@ -1,0 +1,168 @@
+"""Layers that two passes left of a surface become one again."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from scanweld.evaluation.doubled_surfaces import doubled_surfaces
+from scanweld.geometry.views import MapCorrection
+from scanweld.mapping.fusion import FusionConfig
+from scanweld.mapping.mapper import SurfelMapper
+from scanweld.mapping.merging import MergingConfig, merge_doubled
+from scanweld.mapping.surfel_map import SurfelMap
+
+SPACING = 0.01
+
+
+def wall(count: int = 60, height: float = 0.0, *, spacing: float = SPACING, seed: int = 0) -> np.ndarray:
+    """Positions (3, count^2) on the plane z = height, on a grid with some jitter."""
+    rng = np.random.default_rng(seed)
+    x, y = np.meshgrid(np.arange(count) * spacing, np.arange(count) * spacing)
+    positions = np.stack([x.ravel(), y.ravel(), np.full(count * count, height)])
+    positions[:2] += rng.uniform(-0.2, 0.2, (2, count * count)) * spacing
+    return positions.astype(np.float32)
+
+
+def add(
+    surfels: SurfelMap,
+    positions: np.ndarray,
+    *,
+    anchor: int,
+    confidence: float = 10.0,
+    normal: tuple[float, float, float] = (0, 0, 1),
+    grey: float = 100.0,
+    radius: float = SPACING * 0.75,
+) -> None:
+    """Append surfels that all face the same way."""
+    count = positions.shape[1]
+    normals = np.repeat(np.array(normal, np.float32)[:, None], count, axis=1)
+    surfels.append(
+        positions, normals, np.full((3, count), grey, np.float32), np.full(count, radius, np.float32),
+        np.full(count, confidence, np.float32), anchor, anchor,
+    )  # fmt: skip
+
+
+class TestMergeDoubled:
+    def test_two_layers_become_one_between_them(self) -> None:
+        """Of equal confidence: half way; of confidence 30 and 10: a quarter of the way from the stronger."""
+        surfels = SurfelMap()
+        add(surfels, wall(), anchor=0, confidence=30, grey=100)
+        add(surfels, wall(height=0.02, seed=1), anchor=20, confidence=10, grey=200)
+        assert doubled_surfaces(surfels.positions_m.T, surfels.normals.T).share > 0.9
+        gone = merge_doubled(surfels, 100.0)
+        assert gone > 0.95 * 60 * 60
+        assert doubled_surfaces(surfels.positions_m.T, surfels.normals.T).share < 0.01
+        assert np.median(surfels.positions_m[2]) == pytest.approx(0.005, abs=1e-3)
+        assert np.median(surfels.confidences) == pytest.approx(40)
+        assert abs(int(np.median(surfels.colors)) - 125) <= 4
+
+    def test_lateral_places_stay(self) -> None:
+        surfels = SurfelMap()
+        kept = wall()
+        add(surfels, kept, anchor=0, confidence=30)
+        add(surfels, wall(height=0.02, seed=1), anchor=20, confidence=10)
+        merge_doubled(surfels, 100.0)
+        strong = surfels.confidences >= 30
+        np.testing.assert_array_equal(surfels.positions_m[:2, strong], kept[:2])
+
+    @pytest.mark.parametrize(
+        ("height", "anchor", "normal"),
+        [(0.02, 2, (0, 0, 1)), (0.08, 20, (0, 0, 1)), (0.02, 20, (0, 0, -1)), (0.02, 20, (1, 0, 0))],
+        ids=["same pass", "further apart", "the other side of a board", "another direction"],
+    )
+    def test_what_is_not_one_surface_stays(self, height: float, anchor: int, normal: tuple[int, int, int]) -> None:
+        surfels = SurfelMap()
+        add(surfels, wall(), anchor=0)
+        add(surfels, wall(height=height), anchor=anchor, normal=normal)
+        before = surfels.positions_m.copy()
+        assert merge_doubled(surfels, 100.0) == 0
+        np.testing.assert_array_equal(surfels.positions_m, before)
+
+    def test_beside_is_not_behind(self) -> None:
+        """Two passes that share an edge keep all of their surfels."""
+        surfels = SurfelMap()
+        add(surfels, wall(), anchor=0)
+        add(surfels, wall() + np.array([[60 * SPACING + 0.01], [0], [0.02]], np.float32), anchor=20)
+        assert merge_doubled(surfels, 100.0) == 0
+
+    def test_the_finer_surfels_stay(self) -> None:
+        surfels = SurfelMap()
+        add(surfels, wall(20, spacing=0.03), anchor=0, radius=0.0225, confidence=90)
+        add(surfels, wall(height=0.01), anchor=20, confidence=10)
+        merge_doubled(surfels, 100.0)
+        assert np.count_nonzero(surfels.radii_m < 0.01) == 60 * 60
+        assert np.count_nonzero(surfels.radii_m > 0.01) < 0.05 * 400
+
+    def test_confidence_is_bounded(self) -> None:
+        surfels = SurfelMap()
+        add(surfels, wall(), anchor=0, confidence=80)
+        add(surfels, wall(height=0.01), anchor=20, confidence=80)
+        merge_doubled(surfels, 100.0)
+        assert surfels.confidences.max() == 100
+
+    def test_off_and_empty(self) -> None:
+        assert merge_doubled(SurfelMap(), 100.0) == 0
+        surfels = SurfelMap()
+        add(surfels, wall(), anchor=0)
+        add(surfels, wall(height=0.01), anchor=20)
+        assert merge_doubled(surfels, 100.0, MergingConfig(distance_m=0)) == 0
+
+    def test_against_a_plain_reference(self) -> None:
+        rng = np.random.default_rng(3)
+        surfels = SurfelMap()
+        weights = rng.permutation(1500).astype(np.float32) + 1  # no ties: their order is that of the cells
+        for anchor, some in zip((0, 1, 9, 10, 30), np.split(weights, 5), strict=True):
+            positions = rng.uniform(0, 0.3, (3, 300)).astype(np.float32)
+            normals = rng.normal(size=(3, 300))
+            normals[2] += 2
+            normals /= np.linalg.norm(normals, axis=0)
+            surfels.append(
+                positions, normals.astype(np.float32), rng.uniform(0, 255, (3, 300)).astype(np.float32),
+                rng.uniform(0.02, 0.05, 300).astype(np.float32), some, 0, anchor,
+            )  # fmt: skip
+        expected = reference(surfels, 0.04, 0.7, 5, 100.0)
+        gone = merge_doubled(surfels, 100.0)
+        assert gone == 1500 - len(expected) > 100
+        found = np.concatenate([surfels.positions_m, surfels.normals, surfels.confidences[None]]).T
+        np.testing.assert_allclose(found, expected, atol=2e-5, rtol=1e-5)
+
+
+def reference(surfels: SurfelMap, distance: float, cosine: float, gap: int, most: float) -> np.ndarray:
+    """The same in plain NumPy, one surfel at a time: rows of position, normal, confidence."""
+    p, n = surfels.positions_m.T.astype(float), surfels.normals.T.astype(float)
+    r, w, a = surfels.radii_m.astype(float), surfels.confidences.astype(float), surfels.anchors.astype(int)
+    ranking = np.lexsort((np.arange(len(r)), -w, np.floor(np.log(r) / np.log(1.5))))
+    alive = np.ones(len(r), bool)
+    p0, w0 = p.copy(), w.copy()
+    rank = np.empty(len(r), int)
+    rank[ranking] = np.arange(len(r))
+    for k in ranking:
+        if not alive[k]:
+            continue
+        d = p0 - p0[k]
+        h = d @ n[k]
+        lateral = (d**2).sum(axis=1) - h**2
+        eaten = alive & (rank > rank[k]) & (abs(a - a[k]) >= gap) & (abs(h) <= distance) & (n @ n[k] >= cosine)
+        eaten &= lateral <= np.maximum(r, r[k]) ** 2
+        if not eaten.any():
+            continue
+        alive &= ~eaten
+        weight = w0[k] + w0[eaten].sum()
+        p[k] = p0[k] + n[k] * (w0[eaten] @ h[eaten]) / weight
+        direction = w0[k] * n[k] + w0[eaten] @ n[eaten]
+        n[k] = direction / np.linalg.norm(direction)
+        w[k] = min(weight, most)
+    return np.concatenate([p, n, w[:, None]], axis=1)[alive]
+
+
+def test_a_correction_of_the_map_fuses_what_it_brings_together() -> None:
+    """The second pass lies 20 cm off; the loop is closed but for 1 cm."""
+    mapper = SurfelMapper(FusionConfig())
+    add(mapper.map, wall(), anchor=0)
+    add(mapper.map, wall(height=0.2, seed=1), anchor=20)
+    T = np.eye(4)
+    T[2, 3] = -0.19
+    mapper.apply(MapCorrection(np.array([20], np.int32), T[None]))
+    assert len(mapper.map) < 1.05 * 60 * 60
+    assert np.median(mapper.map.positions_m[2]) == pytest.approx(0.005, abs=1e-3)
