@@ -43,6 +43,11 @@ def add(
     )  # fmt: skip
 
 
+def moved(surfels: SurfelMap) -> np.ndarray:
+    """How far a correction that turns the later passes towards the earlier ones has moved each surfel."""
+    return np.repeat(surfels.anchors[None] * np.float32(0.01), 3, axis=0)
+
+
 class TestMergeDoubled:
     def test_two_layers_become_one_between_them(self) -> None:
         """Of equal confidence: half way; of confidence 30 and 10: a quarter of the way from the stronger."""
@@ -50,7 +55,7 @@ class TestMergeDoubled:
         add(surfels, wall(), anchor=0, confidence=30, grey=100)
         add(surfels, wall(height=0.02, seed=1), anchor=20, confidence=10, grey=200)
         assert doubled_surfaces(surfels.positions_m.T, surfels.normals.T).share > 0.9
-        gone = merge_doubled(surfels, 100.0)
+        gone = merge_doubled(surfels, moved(surfels), 100.0)
         assert gone > 0.95 * 60 * 60
         assert doubled_surfaces(surfels.positions_m.T, surfels.normals.T).share < 0.01
         assert np.median(surfels.positions_m[2]) == pytest.approx(0.005, abs=1e-3)
@@ -62,7 +67,7 @@ class TestMergeDoubled:
         kept = wall()
         add(surfels, kept, anchor=0, confidence=30)
         add(surfels, wall(height=0.02, seed=1), anchor=20, confidence=10)
-        merge_doubled(surfels, 100.0)
+        merge_doubled(surfels, moved(surfels), 100.0)
         strong = surfels.confidences >= 30
         np.testing.assert_array_equal(surfels.positions_m[:2, strong], kept[:2])
 
@@ -76,7 +81,7 @@ class TestMergeDoubled:
         add(surfels, wall(), anchor=0)
         add(surfels, wall(height=height), anchor=anchor, normal=normal)
         before = surfels.positions_m.copy()
-        assert merge_doubled(surfels, 100.0) == 0
+        assert merge_doubled(surfels, moved(surfels), 100.0) == 0
         np.testing.assert_array_equal(surfels.positions_m, before)
 
     def test_beside_is_not_behind(self) -> None:
@@ -84,13 +89,13 @@ class TestMergeDoubled:
         surfels = SurfelMap()
         add(surfels, wall(), anchor=0)
         add(surfels, wall() + np.array([[60 * SPACING + 0.01], [0], [0.02]], np.float32), anchor=20)
-        assert merge_doubled(surfels, 100.0) == 0
+        assert merge_doubled(surfels, moved(surfels), 100.0) == 0
 
     def test_the_finer_surfels_stay(self) -> None:
         surfels = SurfelMap()
         add(surfels, wall(20, spacing=0.03), anchor=0, radius=0.0225, confidence=90)
         add(surfels, wall(height=0.01), anchor=20, confidence=10)
-        merge_doubled(surfels, 100.0)
+        merge_doubled(surfels, moved(surfels), 100.0)
         assert np.count_nonzero(surfels.radii_m < 0.01) == 60 * 60
         assert np.count_nonzero(surfels.radii_m > 0.01) < 0.05 * 400
 
@@ -98,15 +103,22 @@ class TestMergeDoubled:
         surfels = SurfelMap()
         add(surfels, wall(), anchor=0, confidence=80)
         add(surfels, wall(height=0.01), anchor=20, confidence=80)
-        merge_doubled(surfels, 100.0)
+        merge_doubled(surfels, moved(surfels), 100.0)
         assert surfels.confidences.max() == 100
 
-    def test_off_and_empty(self) -> None:
-        assert merge_doubled(SurfelMap(), 100.0) == 0
+    def test_what_moved_alike_stays_as_it_is(self) -> None:
+        """Layers that a correction does not bring together are left to fusion."""
         surfels = SurfelMap()
         add(surfels, wall(), anchor=0)
         add(surfels, wall(height=0.01), anchor=20)
-        assert merge_doubled(surfels, 100.0, MergingConfig(distance_m=0)) == 0
+        assert merge_doubled(surfels, np.full((3, len(surfels)), 0.3, np.float32), 100.0) == 0
+
+    def test_off_and_empty(self) -> None:
+        assert merge_doubled(SurfelMap(), np.zeros((3, 0), np.float32), 100.0) == 0
+        surfels = SurfelMap()
+        add(surfels, wall(), anchor=0)
+        add(surfels, wall(height=0.01), anchor=20)
+        assert merge_doubled(surfels, moved(surfels), 100.0, MergingConfig(distance_m=0)) == 0
 
     def test_against_a_plain_reference(self) -> None:
         rng = np.random.default_rng(3)
@@ -122,7 +134,7 @@ class TestMergeDoubled:
                 rng.uniform(0.02, 0.05, 300).astype(np.float32), some, 0, anchor,
             )  # fmt: skip
         expected = reference(surfels, 0.04, 0.7, 5, 100.0)
-        gone = merge_doubled(surfels, 100.0)
+        gone = merge_doubled(surfels, moved(surfels), 100.0)
         assert gone == 1500 - len(expected) > 100
         found = np.concatenate([surfels.positions_m, surfels.normals, surfels.confidences[None]]).T
         np.testing.assert_allclose(found, expected, atol=2e-5, rtol=1e-5)

@@ -58,7 +58,23 @@ class SurfelMapper:
 
     def apply(self, correction: MapCorrection) -> None:
         """Move surfels with their keyframes, and fuse the layers that this brings together."""
+        before = self.map.positions_m.copy()
         self.map.apply_correction(correction)
+        moved_m = self.map.positions_m - before
+        merge_doubled(self.map, moved_m, self.config.max_confidence, self.config.merging)
+        self._candidates = self._index_map = None
+
+    def fresh(self) -> SurfelMapper:
+        """Return a mapper like this one with an empty map; its frames are numbered on from those of this one."""
+        other = SurfelMapper(self.config)
+        other._frames_fused = self._frames_fused
+        return other
+
+    def take_in(self, other: SurfelMapper, correction: MapCorrection) -> None:
+        """Add the map of another mapper, moved with its keyframes, and fuse the layers that this brings together."""
+        other.map.apply_correction(correction)
+        self.map.take_in(other.map)
+        self._frames_fused = max(self._frames_fused, other._frames_fused)
         merge_doubled(self.map, self.config.max_confidence, self.config.merging)
         self._candidates = self._index_map = None
 

@@ -168,6 +168,13 @@ class SurfelMap:
         arrays.created[new] = arrays.last_seen[new] = frame_id
         self.extend(more, anchor)
 
+    def take_in(self, other: SurfelMap) -> None:
+        """Add the surfels of another map in the same world, as they are: their keyframes and ages stay theirs."""
+        arrays, more = self.reserve(len(other)), slice(self._count, self._count + len(other))
+        for name, _, _ in _COLUMNS:
+            getattr(arrays, name)[..., more] = getattr(other.arrays, name)[..., : len(other)]
+        self._count += len(other)
+
     def remove(self, doomed: Bool) -> int:
         """Drop the surfels where `doomed` (N,) is true, keeping the order of the others; returns how many went."""
         if doomed.shape != (self._count,):

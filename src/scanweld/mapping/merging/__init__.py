@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from scanweld.arrays import Array, Bool, Float64, Int64
+from scanweld.arrays import Array, Bool, Float32, Float64, Int64
 from scanweld.config import check_ranges, setting
 from scanweld.mapping.merging import kernels
 from scanweld.mapping.surfel_map import SurfelMap
@@ -18,7 +18,8 @@ from scanweld.mapping.surfel_map import SurfelMap
 _COSINE = 0.7
 _RADIUS_CLASS = 1.5  # surfels within this factor are equally fine; Keller et al. 2013 refine by the same factor
 _BITS = 21  # of a cell's number along an axis
-_AREA_M = 0.25  # cells in which more than one pass is looked for
+_AREA_M = 0.25  # cells in which surfels that moved in different ways are looked for
+_MOVED_M = 0.002  # apart: less than this and the layers lie as they lay before
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -37,7 +38,7 @@ class MergingConfig:
         check_ranges(self)
 
 
-def merge_doubled(surfels: SurfelMap, most: float, config: MergingConfig | None = None) -> int:
+def merge_doubled(surfels: SurfelMap, moved_m: Float32, most: float, config: MergingConfig | None = None) -> int:
     """Fuse the layers that different passes left of a surface; the map is changed, returns how many surfels went.
 
     The finer surfels of the two layers stay, moved along their normals to the mean that the confidences weigh.
@@ -45,13 +46,14 @@ def merge_doubled(surfels: SurfelMap, most: float, config: MergingConfig | None 
     Parameters
     ----------
     surfels : the map
+    moved_m : (3, N), how far the correction has moved each surfel [m]; where all moved alike nothing is looked for
     most : largest confidence of a surfel
     config : when layers are one surface
     """
     config = config or MergingConfig()
     if config.distance_m == 0:
         return 0
-    rows = np.flatnonzero(_seen_twice(surfels, config.gap))
+    rows = np.flatnonzero(_brought_together(surfels, moved_m, config.gap))
     if len(rows) == 0:
         return 0
     positions = surfels.positions_m[:, rows].astype(np.float64)
@@ -82,18 +84,25 @@ def merge_doubled(surfels: SurfelMap, most: float, config: MergingConfig | None 
     return surfels.remove(doomed)
 
 
-def _seen_twice(surfels: SurfelMap, gap: int) -> Bool:
-    """Whether a surfel (N,) is in an area that has surfels of more than one pass."""
+def _brought_together(surfels: SurfelMap, moved_m: Float32, gap: int) -> Bool:
+    """Whether a surfel (N,) is in an area whose surfels are of more than one pass and moved in different ways."""
     anchors = surfels.anchors
     if len(surfels) == 0 or int(np.ptp(anchors)) < gap:
         return np.zeros(len(surfels), np.bool_)
-    cells, cell_of = np.unique(_cells(surfels.positions_m.astype(np.float64), _AREA_M), return_inverse=True)
-    first = np.full(len(cells), np.iinfo(np.int32).max, np.int32)
-    last = np.full(len(cells), -1, np.int32)
-    np.minimum.at(first, cell_of.ravel(), anchors)
-    np.maximum.at(last, cell_of.ravel(), anchors)
-    twice: Bool = (last - first >= gap)[cell_of.ravel()]
-    return twice
+    keys = _cells(surfels.positions_m.astype(np.float64), _AREA_M)
+    order = np.argsort(keys, kind="stable")
+    first = np.flatnonzero(np.diff(keys[order], prepend=-1))
+    together = _range_within(anchors[order], first) >= gap
+    apart = np.max([_range_within(row[order], first) for row in moved_m], axis=0)
+    chosen = np.repeat(together & (apart > _MOVED_M), np.diff(first, append=len(keys)))
+    result: Bool = np.empty(len(keys), np.bool_)
+    result[order] = chosen
+    return result
+
+
+def _range_within(values: Array, first: Int64) -> Array:
+    """Return the largest minus the smallest value of each group; groups begin at `first`."""
+    return np.asarray(np.maximum.reduceat(values, first) - np.minimum.reduceat(values, first))
 
 
 def _cells(positions_m: Float64, side_m: float) -> Int64:
