@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from scanweld.arrays import Bool, Float64, Int32
+from scanweld.arrays import Bool, Float32, Float64, Int32
 from scanweld.geometry import se3
 from scanweld.geometry.camera import PinholeCamera
 from scanweld.geometry.depth import SurfacePyramid
@@ -58,11 +58,7 @@ class SurfelMapper:
 
     def apply(self, correction: MapCorrection) -> None:
         """Move surfels with their keyframes, and fuse the layers that this brings together."""
-        before = self.map.positions_m.copy()
-        self.map.apply_correction(correction)
-        moved_m = self.map.positions_m - before
-        merge_doubled(self.map, moved_m, self.config.max_confidence, self.config.merging)
-        self._candidates = self._index_map = None
+        self._merge(_moved(self.map, correction))
 
     def fresh(self) -> SurfelMapper:
         """Return a mapper like this one with an empty map; its frames are numbered on from those of this one."""
@@ -72,10 +68,13 @@ class SurfelMapper:
 
     def take_in(self, other: SurfelMapper, correction: MapCorrection) -> None:
         """Add the map of another mapper, moved with its keyframes, and fuse the layers that this brings together."""
-        other.map.apply_correction(correction)
+        stayed, moved = np.zeros((3, len(self.map)), np.float32), _moved(other.map, correction)
         self.map.take_in(other.map)
         self._frames_fused = max(self._frames_fused, other._frames_fused)
-        merge_doubled(self.map, self.config.max_confidence, self.config.merging)
+        self._merge(np.concatenate([stayed, moved], axis=1))
+
+    def _merge(self, moved_m: Float32) -> None:
+        merge_doubled(self.map, moved_m, self.config.max_confidence, self.config.merging)
         self._candidates = self._index_map = None
 
     def _moved_pixels(self, T_world_camera: Float64, camera: PinholeCamera, depth_m: float) -> float:
@@ -86,6 +85,13 @@ class SurfelMapper:
         shift, turn = float(np.linalg.norm(motion[:3, 3])), float(se3.rotation_angle_rad(motion))
         # At the corners of the image a turn moves pixels by half as much again as in the middle.
         return max(camera.fx, camera.fy) * (1.5 * turn + shift / depth_m)
+
+
+def _moved(surfels: SurfelMap, correction: MapCorrection) -> Float32:
+    """Apply a correction; returns how far each surfel moved (3, N) [m]."""
+    before = surfels.positions_m.copy()
+    surfels.apply_correction(correction)
+    return np.asarray(surfels.positions_m - before)
 
 
 NEAREST_M, TYPICAL_M = 0.3, 1.0
