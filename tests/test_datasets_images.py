@@ -30,6 +30,7 @@ from scanweld.datasets.images import (
     resize_depth,
     valid_depth,
 )
+from scanweld.datasets.png import decode_png
 from scanweld.errors import DatasetError, InvalidInputError, UnreadableFrameError
 from scanweld.geometry.camera import PinholeCamera
 from written_sequences import color_rgb, depth_units, write_image
@@ -176,6 +177,91 @@ def test_intact_chunks_around_rubbish(tmp_path: Path) -> None:
     path.write_bytes(PNG[:8] + chunk(b"IHDR", header) + chunk(b"IDAT", b"rubbish") + chunk(b"IEND", b""))
     with pytest.raises(UnreadableFrameError, match="cannot be decoded"):
         read_depth_png(path, SHAPE, 1000)
+
+
+def written_png(image: np.ndarray, filters: list[int]) -> bytes:
+    """A PNG file of (H, W) uint16 or (H, W, 3) uint8 whose rows have the given filters, after the specification."""
+    size = 2 if image.ndim == 2 else 3
+    rows = image.astype(">u2").view(np.uint8) if size == 2 else image.reshape(len(image), -1)
+    rows = rows.astype(int)
+    lines = b""
+    for v, kind in enumerate(filters):
+        x, above = rows[v], rows[v - 1] if v else np.zeros_like(rows[v])
+        left = np.concatenate([np.zeros(size, int), x[:-size]])
+        corner = np.concatenate([np.zeros(size, int), above[:-size]])
+        p = left + above - corner
+        near = [np.abs(p - left), np.abs(p - above), np.abs(p - corner)]
+        paeth = np.choose(np.argmin(near, axis=0), [left, above, corner])  # of equals the first
+        guess = [0, left, above, (left + above) // 2, paeth][kind] if kind < 5 else 0
+        lines += bytes([kind]) + ((x - guess) % 256).astype(np.uint8).tobytes()
+    height, width = image.shape[:2]
+    header = bytes([16 if size == 2 else 8, 0 if size == 2 else 2, 0, 0, 0])
+    stream = zlib.compress(lines)
+    parts = [stream[k : k + 500] for k in range(0, len(stream), 500)]
+    return (
+        b"\x89PNG\r\n\x1a\n"
+        + chunk(b"IHDR", width.to_bytes(4, "big") + height.to_bytes(4, "big") + header)
+        + b"".join(chunk(b"IDAT", part) for part in parts)
+        + chunk(b"IEND", b"")
+    )
+
+
+@pytest.mark.parametrize("kind", ["depth", "rgb"])
+@pytest.mark.parametrize("filters", ["01234432104", "44444444444", "00000000000"])
+def test_every_filter_of_png_rows(tmp_path: Path, kind: str, filters: str) -> None:
+    """The decoder for these two kinds of PNG gives what was written, as does OpenCV."""
+    rng = np.random.default_rng(len(filters))
+    image = (
+        rng.integers(1, 65535, (11, 37), np.uint16) if kind == "depth" else rng.integers(0, 256, (11, 37, 3), np.uint8)
+    )
+    path = tmp_path / "written.png"
+    path.write_bytes(written_png(image, [int(c) for c in filters]))
+    decoded = decode_png(path.read_bytes())
+    assert decoded is not None
+    assert decoded.dtype == image.dtype
+    np.testing.assert_array_equal(decoded, image)
+    by_opencv = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    np.testing.assert_array_equal(decoded, by_opencv if kind == "depth" else by_opencv[..., ::-1])
+    read = read_depth_png(path, (11, 37), 1.0) if kind == "depth" else read_color(path, (11, 37))
+    np.testing.assert_array_equal(read, image)
+
+
+def test_without_libdeflate_pixels_are_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    image = np.random.default_rng(0).integers(0, 65535, (20, 30), np.uint16)
+    data = written_png(image, [4] * 20)
+    for absent in (False, True):
+        if absent:
+            monkeypatch.setattr("scanweld.datasets.png.deflate", None)
+        np.testing.assert_array_equal(decode_png(data), image)
+
+
+@pytest.mark.parametrize("fault", ["unknown filter", "too short", "too long", "rubbish", "cut"])
+def test_damage_within_intact_chunks(tmp_path: Path, fault: str) -> None:
+    """Whatever the chunks' checksums say, the stream must hold exactly the image."""
+    image = np.random.default_rng(1).integers(1, 65535, (8, 12), np.uint16)
+    lines = b"".join(b"\0" + row.astype(">u2").tobytes() for row in image)
+    stream = {
+        "unknown filter": zlib.compress(b"\7" + lines[1:]), "too short": zlib.compress(lines[:-1]),
+        "too long": zlib.compress(lines + b"\0"), "rubbish": b"\x78\x9c" + lines[:50], "cut": zlib.compress(lines)[:-6],
+    }[fault]  # fmt: skip
+    path = tmp_path / "damaged.png"
+    header = (12).to_bytes(4, "big") + (8).to_bytes(4, "big") + bytes([16, 0, 0, 0, 0])
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", stream) + chunk(b"IEND", b""))
+    with pytest.raises(UnreadableFrameError, match=r"damaged\.png: cannot be decoded"):
+        read_depth_png(path, (8, 12), 1000.0)
+
+
+def test_other_kinds_of_png_are_left_to_opencv(tmp_path: Path) -> None:
+    grey = np.random.default_rng(2).integers(0, 256, (9, 14), np.uint8)
+    assert decode_png(png_bytes(grey)) is None
+    assert decode_png(png_bytes(np.dstack([grey] * 4))) is None
+    plain = written_png(np.dstack([grey] * 3), [1] * 9)
+    transparent = plain[:33] + chunk(b"tRNS", bytes(6)) + plain[33:]
+    assert decode_png(plain) is not None
+    assert decode_png(transparent) is None
+    path = tmp_path / "transparent.png"
+    path.write_bytes(transparent)
+    np.testing.assert_array_equal(read_color(path, (9, 14)), np.dstack([grey] * 3))
 
 
 def test_missing_empty_and_foreign_files(tmp_path: Path) -> None:

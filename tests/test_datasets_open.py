@@ -16,6 +16,15 @@ from scanweld.datasets.open import FORMATS, open_sequence
 from scanweld.datasets.selection import parse_frames, select
 from scanweld.errors import DatasetError, InvalidInputError, ScanweldError, UnreadableFrameError
 from scanweld.geometry.camera import PinholeCamera
+from written_captures import (
+    write_bundle_fusion,
+    write_eth3d,
+    write_record3d,
+    write_replica,
+    write_sens,
+    write_stray,
+    write_video_pair,
+)
 from written_sequences import (
     HEIGHT,
     WIDTH,
@@ -43,10 +52,26 @@ def test_each_layout_is_recognised_by_its_own_format_first(tmp_path: Path) -> No
         "7scenes": write_seven_scenes(tmp_path / "s"),
         "tum": write_tum(tmp_path / "t"),
         "icl": tmp_path / "icl",
+        "replica": write_replica(tmp_path / "scenes/office0"),
+        "eth3d": write_eth3d(tmp_path / "e"),
+        "bonn": write_tum(tmp_path / "rgbd_bonn_balloon"),
+        "bundlefusion": write_bundle_fusion(tmp_path / "b"),
+        "stray": write_stray(tmp_path / "p"),
+        "video": write_video_pair(tmp_path / "v", depth="depth"),
     }
+    files = {
+        "scannet": write_sens(tmp_path / "a/scene.sens"),
+        "record3d": write_record3d(tmp_path / "c/a.r3d", {}),
+        "rosbag": tmp_path / "d/a.bag",
+    }
+    (tmp_path / "d").mkdir()
+    files["rosbag"].touch()
+    folders |= {name: file.parent for name, file in files.items()}
     assert set(folders) == {row.name for row in FORMATS}
     for name, folder in folders.items():
         assert next(row.name for row in FORMATS if row.recognises(folder)) == name
+    for name, file in files.items():
+        assert [row.name for row in FORMATS if file.suffix in row.suffixes] == [name]
 
 
 def test_a_folder_named_like_icl_with_its_own_truth_is_taken_as_it_is(tmp_path: Path) -> None:
@@ -310,7 +335,11 @@ def test_missing_folder(tmp_path: Path) -> None:
 
 def test_a_file_instead_of_a_folder(tmp_path: Path) -> None:
     (tmp_path / "seq.zip").touch()
-    fails(tmp_path / "seq.zip", "is a file, expected a sequence folder; unpack it")
+    fails(tmp_path / "seq.zip", r"is a file, expected a sequence folder or one of [.]sens, .*; unpack it")
+
+
+def test_a_file_named_as_another_format(tmp_path: Path) -> None:
+    fails(write_sens(tmp_path / "a.sens"), "not a sequence of format 'tum'; it looks like 'scannet'", format="tum")
 
 
 def test_unknown_layout_says_what_is_there(tmp_path: Path) -> None:
@@ -323,8 +352,8 @@ def test_unknown_layout_says_what_is_there(tmp_path: Path) -> None:
 def test_unknown_format_names_the_known(tmp_path: Path) -> None:
     fails(
         write_redwood(tmp_path),
-        "format 'rosbag' is not known; known are auto, 7scenes, icl, tum, redwood",
-        format="rosbag",
+        "format 'webcam' is not known; known are auto, scannet, .*7scenes, .*icl, .*tum, .*redwood",
+        format="webcam",
     )
 
 

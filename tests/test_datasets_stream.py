@@ -11,6 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import scanweld as sw
+from rendered import CAMERA as RENDERED_CAMERA
+from rendered import MemorySequence, blind, rendered
 from scanweld.arrays import Float64
 from scanweld.datasets.base import readable_frames
 from scanweld.datasets.open import open_sequence
@@ -123,6 +126,44 @@ def test_a_bug_in_the_decoder_reaches_the_consumer_at_its_frame() -> None:
     assert not decode_threads()
 
 
+def test_frames_are_prepared_ahead_on_the_decoding_thread() -> None:
+    names: list[str] = []
+
+    def prepare(frame: Frame) -> float:
+        names.append(threading.current_thread().name)
+        return frame.timestamp_s * 2
+
+    records = list(stream(Recorded(6, unreadable=(2,), seconds=0.001), 3, num_threads=2, prepare=prepare))
+    assert [record.prepared for record in records] == [0, 0.2, None, 0.6, 0.8, 1.0]
+    assert len(names) == 5
+    assert all(name.startswith("scanweld-decode") for name in names)
+
+
+def test_no_more_is_prepared_than_asked() -> None:
+    """What is prepared waits in memory: the bound holds for it, too."""
+    prepared: list[float] = []
+    records = stream(Recorded(20), 2, prepare=lambda frame: prepared.append(frame.timestamp_s))
+    next(records)
+    deadline = time.monotonic() + 5
+    while len(prepared) < 3 and time.monotonic() < deadline:
+        time.sleep(0.001)
+    time.sleep(0.02)
+    assert prepared == [0, 0.1, 0.2], "one delivered, two ahead"
+    records.close()
+
+
+def test_an_error_while_preparing_reaches_the_consumer_at_its_frame() -> None:
+    def prepare(frame: Frame) -> None:
+        if frame.timestamp_s == 0.2:
+            raise InvalidInputError("not to be prepared")
+
+    records = stream(Recorded(10), prepare=prepare)
+    assert [next(records).index, next(records).index] == [0, 1]
+    with pytest.raises(InvalidInputError, match="not to be prepared"):
+        next(records)
+    assert not decode_threads()
+
+
 def test_no_readable_frame_at_all() -> None:
     records = stream(Recorded(3, unreadable=(0, 1, 2)))
     assert [record.frame for record in (next(records), next(records), next(records))] == [None, None, None]
@@ -151,3 +192,39 @@ def test_files_with_a_truncated_image(tmp_path: Path) -> None:
     records = list(stream(open_sequence(tmp_path)))
     assert [record.frame is None for record in records] == [False, False, True, False]
     assert "00002.jpg: truncated JPEG" in records[2].error
+
+
+class TestSurfacesMadeAhead:
+    """Slam.prepare on the decoding thread: when a frame is prepared changes nothing."""
+
+    def sequence(self) -> MemorySequence:
+        part = rendered(noise="kinect").part(0, 12)
+        return part.with_frames({4: None, 7: blind(part.read(7))})
+
+    def run(self, lookahead: int, num_threads: int, prepared: bool) -> tuple[bytes, list[str]]:
+        slam = sw.build_slam(RENDERED_CAMERA)
+        records = stream(
+            self.sequence(), lookahead, num_threads=num_threads, prepare=slam.prepare if prepared else None
+        )
+        for record in records:
+            assert (record.prepared is not None) == (prepared and record.frame is not None)
+            if record.frame is None:
+                slam.skip(record.timestamp_s, record.error)
+            else:
+                slam.process(record.frame, pyramid=record.prepared)
+        poses = b"".join(result.T_world_camera.tobytes() for result in slam.results)
+        surfels = b"".join(np.array(getattr(slam.map, name)).tobytes() for name in ("positions_m", "normals", "colors"))
+        return poses + surfels, [result.state.name for result in slam.results]
+
+    def test_same_bytes(self) -> None:
+        expected, states = self.run(1, 1, prepared=False)
+        assert states.count("TRACKING") >= 8
+        for lookahead, num_threads in ((1, 1), (4, 3)):
+            assert self.run(lookahead, num_threads, prepared=True) == (expected, states)
+
+    def test_surfaces_of_another_frame_are_refused(self) -> None:
+        one, other = rendered(noise="kinect").frames[:2]
+        slam = sw.build_slam(RENDERED_CAMERA)
+        with pytest.raises(InvalidInputError, match=r"that of the frame at 0\.03"):
+            slam.process(one, pyramid=slam.prepare(other))
+        assert not slam.results

@@ -10,7 +10,14 @@ from hypothesis import given
 import scanweld as sw
 from rendered import CAMERA, frame_of, plane_depth
 from scanweld.geometry import kernels
-from scanweld.geometry.depth import bilateral_filter, half_size, intrinsics_array, surface_image
+from scanweld.geometry.depth import (
+    bilateral_filter,
+    half_size,
+    intrinsics_array,
+    luminance,
+    noise_scale,
+    surface_image,
+)
 
 SMALL = sw.PinholeCamera(60.0, 62.0, 30.2, 22.9, 61, 47)
 
@@ -31,6 +38,48 @@ def halved(depth: np.ndarray, band: float) -> np.ndarray:
         if block.size:
             out[v, u] = block[block <= block.min() * (1 + band)].mean()
     return out
+
+
+def slanted_steps(seed: int, camera: sw.PinholeCamera) -> np.ndarray:
+    """Depth of tilted planes behind each other, with noise and holes: all that the window has to tell apart."""
+    rng = np.random.default_rng(seed)
+    v, u = np.mgrid[0 : camera.height, 0 : camera.width]
+    planes = [plane_depth((0.5, 0.1, 1), 1.0, camera), plane_depth((-0.2, 0.4, 1), 2.0, camera)]
+    depth = np.where((u // 17 + v // 11) % 2 == 0, *planes)
+    depth = depth * (1 + 0.0005 * rng.standard_normal(depth.shape))
+    depth[rng.random(depth.shape) < 0.05] = 0
+    return depth.astype(np.float32)
+
+
+def plain_surface(depth_m: np.ndarray, camera: sw.PinholeCamera, config: sw.SurfaceConfig) -> np.ndarray:
+    """The surface image (H, W, 8) by its definition, in double precision: sums over the pairs of the window."""
+    depth, r = depth_m.astype(np.float64), config.normal_radius
+    inverse = np.divide(1, depth, out=np.zeros_like(depth), where=depth > 0)
+    sigma = config.noise_floor_m + config.noise_growth * (depth - config.noise_nearest_m) ** 2
+    padded = np.pad(inverse, r)
+    height, width = depth.shape
+    sxx, sxy, syy, sx, sy = np.zeros((5, height, width))
+    for dv in range(r + 1):
+        for du in range(-r if dv else 1, r + 1):
+            a = padded[r - dv : r - dv + height, r - du : r - du + width]
+            b = padded[r + dv : r + dv + height, r + du : r + du + width]
+            use = (depth > 0) & (a > 0) & (b > 0) & (np.abs(a + b - 2 * inverse) < 8 * sigma * inverse**2)
+            slope = np.where(use, b - a, 0)
+            sxx, sxy, syy = sxx + use * du * du, sxy + use * du * dv, syy + use * dv * dv
+            sx, sy = sx + slope * du, sy + slope * dv
+    determinant = sxx * syy - sxy**2
+    good = determinant > 0.5
+    good[:, :r] = good[:, max(width - r, 0) :] = False
+    scale = 0.5 / np.where(good, determinant, 1)
+    rays = camera.rays()
+    a, b = camera.fx * scale * (syy * sx - sxy * sy), camera.fy * scale * (sxx * sy - sxy * sx)
+    n = np.stack([a, b, inverse - a * rays[..., 0] - b * rays[..., 1]], axis=-1)
+    n /= np.maximum(np.linalg.norm(n, axis=-1, keepdims=True), 1e-30)
+    cosine = (n * rays).sum(axis=-1) / np.linalg.norm(rays, axis=-1)
+    good &= cosine > config.min_cosine
+    radius = depth * 0.70711 / camera.fx / np.maximum(cosine, 0.26)
+    rest = np.concatenate([-n, (1 / sigma)[..., None], radius[..., None]], axis=-1)
+    return np.concatenate([rays * depth[..., None], np.where(good[..., None], rest, 0)], axis=-1)
 
 
 class TestHalfSize:
@@ -71,6 +120,23 @@ class TestHalfSize:
 
 
 class TestSurfaces:
+    @pytest.mark.parametrize("radius", [1, 2, 3])
+    @pytest.mark.parametrize("size", [(61, 47), (1100, 13)])
+    def test_matches_numpy(self, size: tuple[int, int], radius: int) -> None:
+        """Also where a row is longer than a block of the kernel.
+
+        An inverse depth near 1 / m is rounded to 2^-24, a slope in units of the focal length by fx times that.
+        """
+        camera = sw.PinholeCamera(60.0 * size[0] / 61, 62.0 * size[1] / 47, size[0] / 2, size[1] / 2, *size)
+        depth, config = slanted_steps(radius, camera), sw.SurfaceConfig(normal_radius=radius)
+        surface, expected = surface_image(depth, camera, config), plain_surface(depth, camera, config)
+        has = expected[..., 6] > 0
+        assert has.mean() > 0.3
+        np.testing.assert_array_equal(surface[..., 6] > 0, has)
+        np.testing.assert_allclose(surface[..., :3], expected[..., :3], rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(surface[..., 3:6], expected[..., 3:6], atol=2e-5 + camera.fx * 2**-23)
+        np.testing.assert_allclose(surface[..., 6:], expected[..., 6:], rtol=1e-4)
+
     @given(
         tilt=st.floats(0, 1.1), turn=st.floats(0, 2 * np.pi), distance_m=st.floats(0.3, 4),
         radius=st.integers(1, 4),
@@ -162,7 +228,7 @@ class TestSurfaces:
         depth = random_depth(6, SMALL.shape, invalid=0.05) * np.float32(0.01) + np.float32(1)
         config = sw.SurfaceConfig(normal_radius=3)
         arguments = (depth, intrinsics_array(SMALL), 3, config.noise, np.float32(0.15))
-        whole, pieces = (np.full((*SMALL.shape, 8), 7, np.float32) for _ in range(2))
+        whole, pieces = (np.full((47, 61 * 8), 7, np.float32) for _ in range(2))
         kernels.surface_rows(0, 47, *arguments, whole)
         for start, stop in ((20, 21), (0, 1), (21, 47), (1, 20)):
             kernels.surface_rows(start, stop, *arguments, pieces)
@@ -171,6 +237,34 @@ class TestSurfaces:
     def test_wrong_shape_is_refused(self) -> None:
         with pytest.raises(sw.InvalidInputError, match=r"\(47, 60\)"):
             surface_image(np.ones((47, 60), np.float32), SMALL, sw.SurfaceConfig())
+
+
+class TestNoiseScale:
+    def test_matches_numpy(self) -> None:
+        rng = np.random.default_rng(11)
+        depth = (plane_depth((0.2, 0.1, 1), 1.5) * (1 + 0.01 * rng.standard_normal(CAMERA.shape))).astype(np.float32)
+        depth[rng.random(depth.shape) < 0.1] = 0
+        config, ratios = sw.SurfaceConfig(), []
+        for image in (depth[::8].astype(np.float64), depth.T[::8].astype(np.float64)):
+            before, centre, behind = image[:, :-6:4], image[:, 3:-3:4], image[:, 6::4]
+            valid = (before > 0) & (centre > 0) & (behind > 0)
+            a, z, b = before[valid], centre[valid], behind[valid]
+            sigma = config.noise_floor_m + config.noise_growth * (z - config.noise_nearest_m) ** 2
+            ratios.append(np.abs(1 / a + 1 / b - 2 / z) * z * z / np.sqrt(6) / sigma)
+        expected = 1.4826 * np.median(np.concatenate(ratios))
+        assert 1 < expected < config.max_noise_scale
+        assert noise_scale(depth, config) == pytest.approx(expected, rel=1e-5)
+
+    def test_finds_the_noise_that_was_added(self) -> None:
+        """At 2 m the model has 0.0012 + 0.0019 * 1.6^2 m; three times that is seen as three."""
+        rng, sigma = np.random.default_rng(12), 0.0012 + 0.0019 * 1.6**2
+        depth = 2 + 3 * sigma * rng.standard_normal(CAMERA.shape)
+        assert noise_scale(depth.astype(np.float32), sw.SurfaceConfig()) == pytest.approx(3, rel=0.1)
+
+    @pytest.mark.parametrize("shape", [(1, 1), (5, 200), (200, 5), (480, 640)])
+    def test_too_little_to_see_trusts_the_model(self, shape: tuple[int, int]) -> None:
+        assert noise_scale(np.zeros(shape, np.float32), sw.SurfaceConfig()) == 1.0
+        assert noise_scale(np.ones(shape, np.float32), sw.SurfaceConfig()) == 1.0
 
 
 class TestBilateral:
@@ -226,6 +320,15 @@ class TestPyramid:
         level = sw.build_pyramid(frame, sw.SurfaceConfig(max_depth_m=8.0)).levels[0]
         assert not level.surface[:, 80:].any()
         assert (frame.depth_m[:, 80:] == 9.0).all()
+
+    def test_brightness_of_the_finest_level(self) -> None:
+        depth = plane_depth((0, 0, 1), 1.0)
+        color = np.random.default_rng(13).integers(0, 256, (*CAMERA.shape, 3), np.uint8)
+        grey = sw.build_pyramid(sw.Frame(0.0, depth.astype(np.float32), color, CAMERA)).grey
+        assert grey is not None
+        np.testing.assert_allclose(grey, color @ np.array([0.299, 0.587, 0.114]), rtol=1e-6)
+        np.testing.assert_array_equal(luminance(color[::-1, ::-1]), grey[::-1, ::-1])
+        assert sw.build_pyramid(sw.Frame(0.0, depth.astype(np.float32), None, CAMERA)).grey is None
 
     def test_bilateral_smooths_the_finest_level(self) -> None:
         rng = np.random.default_rng(10)

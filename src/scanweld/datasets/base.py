@@ -11,6 +11,7 @@ from typing import Protocol, TypeAlias, runtime_checkable
 import numpy as np
 
 from scanweld.arrays import Float32, Float64
+from scanweld.datasets.gyroscope import Gyroscope, gyroscope_of
 from scanweld.datasets.images import read_color, read_depth_png
 from scanweld.errors import DatasetError, UnreadableFrameError
 from scanweld.geometry.camera import PinholeCamera
@@ -134,6 +135,7 @@ class FileSequence:
     depth_scale: float
     ground_truth: Trajectory | None = None
     depth_reader: DepthReader = read_depth_png
+    gyroscope: Gyroscope | None = None
 
     def __post_init__(self) -> None:
         if not self.frames:
@@ -159,6 +161,53 @@ class FileSequence:
         depth_m = self.depth_reader(files.depth, self.camera.shape, self.depth_scale)
         color = None if files.color is None else read_color(files.color, self.camera.shape)
         return Frame(files.timestamp_s, depth_m, color, self.camera)
+
+    def __iter__(self) -> Iterator[Frame]:
+        return readable_frames(self)
+
+
+@dataclass(frozen=True, slots=True)
+class WrappedSequence:
+    """The frames of `base` as they are; what wraps a sequence differs from it in a method or two."""
+
+    base: RgbdSequence
+
+    @property
+    def name(self) -> str:
+        """Name of the sequence underneath."""
+        return self.base.name
+
+    @property
+    def camera(self) -> PinholeCamera:
+        """Intrinsics of every frame."""
+        return self.base.camera
+
+    @property
+    def depth_scale(self) -> float:
+        """Units per metre of the stored depth."""
+        return self.base.depth_scale
+
+    @property
+    def ground_truth(self) -> Trajectory | None:
+        """True poses of the sequence underneath, at their own times."""
+        return self.base.ground_truth
+
+    @property
+    def gyroscope(self) -> Gyroscope | None:
+        """What the gyroscope of the sequence underneath measured, at its own times."""
+        return gyroscope_of(self.base)
+
+    @property
+    def timestamps_s(self) -> Float64:
+        """Time of every frame (N,) [s]."""
+        return self.base.timestamps_s
+
+    def __len__(self) -> int:
+        return len(self.base)
+
+    def read(self, index: int) -> Frame:
+        """Read frame `index`."""
+        return self.base.read(index)
 
     def __iter__(self) -> Iterator[Frame]:
         return readable_frames(self)

@@ -25,6 +25,12 @@ MAX_PIXELS = 1 << 26
 MAX_DEPTH_M = 65535.0
 """Depth beyond this is no measurement in any unit; the mapper has its own, much shorter range."""
 
+MAX_DEPTH_SCALE = 1e9
+"""Most units per metre that a depth image can have: nanometres."""
+
+MIN_DEPTH_SCALE = 1e-3
+"""Fewest: kilometres."""
+
 SURFACE_BAND = 0.02
 """Depths that differ by less than this share of the depth belong to one surface when an image is resized."""
 
@@ -63,7 +69,7 @@ def read_header(path: Path) -> ImageHeader:
     UnreadableFrameError
         When the file is missing, truncated, damaged, or neither PNG nor JPEG.
     """
-    return _intact(path, _read_bytes(path))
+    return header_of(read_file(path), path)
 
 
 def read_color(path: Path, shape: tuple[int, int]) -> UInt8:
@@ -74,14 +80,22 @@ def read_color(path: Path, shape: tuple[int, int]) -> UInt8:
     UnreadableFrameError
         When the file is damaged or not of the expected `shape` (height, width).
     """
+    return decode_color(read_file(path), path, shape)
+
+
+def decode_color(data: bytes, where: Path | str, shape: tuple[int, int]) -> UInt8:
+    """Decode a PNG or JPEG image in memory as `read_color` does a file; `where` names it in errors."""
+    _require_shape(where, header_of(data, where), shape)
+    color = _decode_quickly(where, data)
+    if color is not None and color.ndim == 3:
+        return color
     import cv2
 
-    data = _read_bytes(path)
-    _require_shape(path, _intact(path, data), shape)
     # A camera that was held upright writes an EXIF orientation; the depth image has none.
-    image = _decode(path, data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    color: UInt8 = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
-    return color
+    as_rgb = getattr(cv2, "IMREAD_COLOR_RGB", None)  # OpenCV 4.11
+    flags = cv2.IMREAD_COLOR if as_rgb is None else as_rgb
+    image = _decode(where, data, flags | cv2.IMREAD_IGNORE_ORIENTATION)
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB) if as_rgb is None else image, dtype=np.uint8)
 
 
 def read_depth_png(path: Path, shape: tuple[int, int], depth_scale: float) -> Float32:
@@ -98,15 +112,45 @@ def read_depth_png(path: Path, shape: tuple[int, int], depth_scale: float) -> Fl
     UnreadableFrameError
         When the file is damaged, not of the expected shape, or not one channel of 16 bits.
     """
-    import cv2
+    return depth_from_units(decode_uint16_png(read_file(path), path, shape), depth_scale)
 
-    data = _read_bytes(path)
-    header = _intact(path, data)
-    _require_shape(path, header, shape)
+
+def decode_uint16_png(data: bytes, where: Path | str, shape: tuple[int, int]) -> Array:
+    """Decode a PNG image of one channel with 16 bits in memory, (H, W) uint16; `where` names it in errors.
+
+    Raises
+    ------
+    UnreadableFrameError
+        When it is damaged, not of the expected shape, or of other content.
+    """
+    header = header_of(data, where)
+    _require_shape(where, header, shape)
     fault = depth_header_fault(header)
     if fault:
-        raise UnreadableFrameError(f"{path}: {fault}")
-    raw = _decode(path, data, cv2.IMREAD_UNCHANGED)
+        raise UnreadableFrameError(f"{where}: {fault}")
+    raw = _decode_quickly(where, data)
+    if raw is not None:
+        return raw
+    import cv2
+
+    return _decode(where, data, cv2.IMREAD_UNCHANGED)
+
+
+def decode_uint8_png(data: bytes, where: Path | str, shape: tuple[int, int]) -> UInt8:
+    """Decode a PNG image of one channel with 8 bits in memory, (H, W) uint8; see `decode_uint16_png`."""
+    import cv2
+
+    header = header_of(data, where)
+    _require_shape(where, header, shape)
+    if (header.bits, header.channels) != (8, 1):
+        raise UnreadableFrameError(
+            f"{where}: it has {header.bits} bits and {header.channels} channels, expected one channel of 8 bits"
+        )
+    return np.asarray(_decode(where, data, cv2.IMREAD_UNCHANGED), dtype=np.uint8)
+
+
+def depth_from_units(raw: Array, depth_scale: float) -> Float32:
+    """Return depth (H, W) float32 [m] from unsigned 16-bit units; 0 and 65535 are invalid and become 0."""
     depth: Float32 = np.divide(raw, np.float32(depth_scale), dtype=np.float32)
     if raw.max() == 65535:
         depth[raw == 65535] = 0
@@ -130,7 +174,7 @@ def read_ray_distance_text(path: Path, shape: tuple[int, int], depth_scale: floa
     UnreadableFrameError
         When the file is missing, holds something else than numbers, or not H * W of them.
     """
-    data = _read_bytes(path)
+    data = read_file(path)
     with warnings.catch_warnings():
         warnings.simplefilter("error", DeprecationWarning)  # how NumPy reports text that is no number
         try:
@@ -293,14 +337,27 @@ def _unit(depth_scale: float) -> str:
     return names.get(depth_scale, f"1/{depth_scale:g} m")
 
 
-def _read_bytes(path: Path) -> bytes:
+def read_file(path: Path) -> bytes:
+    """Return the content of an image file; raises UnreadableFrameError when it cannot be read."""
     try:
         return path.read_bytes()
     except OSError as error:
         raise UnreadableFrameError(f"{path}: {error.strerror or error}") from None
 
 
-def _decode(path: Path, data: bytes, flags: int) -> Array:
+def _decode_quickly(where: Path | str, data: bytes) -> Array | None:
+    """Decode a PNG of a kind that there is a fast decoder for; None for others."""
+    if not data.startswith(_PNG_MAGIC):
+        return None
+    from scanweld.datasets.png import decode_png
+
+    try:
+        return decode_png(data)
+    except ValueError as error:
+        raise UnreadableFrameError(f"{where}: cannot be decoded ({error})") from None
+
+
+def _decode(path: Path | str, data: bytes, flags: int) -> Array:
     import cv2
 
     try:
@@ -312,14 +369,15 @@ def _decode(path: Path, data: bytes, flags: int) -> Array:
     return np.asarray(image)
 
 
-def _require_shape(path: Path, header: ImageHeader, shape: tuple[int, int]) -> None:
+def _require_shape(path: Path | str, header: ImageHeader, shape: tuple[int, int]) -> None:
     if (header.height, header.width) != shape:
         raise UnreadableFrameError(
             f"{path}: the image is {header.width}x{header.height}, the sequence {shape[1]}x{shape[0]}"
         )
 
 
-def _intact(path: Path, data: bytes) -> ImageHeader:
+def header_of(data: bytes, path: Path | str) -> ImageHeader:
+    """Return the header of a PNG or JPEG image in memory, after checking that it is complete; see `read_header`."""
     if data.startswith(_PNG_MAGIC):
         header = _png_header(data)
     elif data.startswith(b"\xff\xd8"):
@@ -398,7 +456,9 @@ def require_depth_scale(depth_scale: float, where: str = "") -> float:
     DatasetError
         When it is not.
     """
-    if not (math.isfinite(depth_scale) and depth_scale > 0):
+    if not MIN_DEPTH_SCALE <= depth_scale <= MAX_DEPTH_SCALE:
         place = f"{where}: " if where else ""
-        raise DatasetError(f"{place}depth_scale must be positive (units per metre, e.g. 1000), got {depth_scale}")
+        raise DatasetError(
+            f"{place}depth_scale must be positive and plausible (units per metre, e.g. 1000), got {depth_scale}"
+        )
     return depth_scale

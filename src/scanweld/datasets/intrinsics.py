@@ -6,7 +6,7 @@ import json
 import logging
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +20,14 @@ Intrinsics = tuple[float, float, float, float]
 
 CAMERA_FILE = "camera.json"
 
+MAX_TEXT_BYTES = 1 << 26
+"""Largest description of a camera or a recording that is read."""
+
 PLAUSIBLE_FOCAL = (0.2, 5.0)
 """Focal length of a depth camera as a multiple of the image width: 136 to 11 degrees across."""
+
+
+_ABSURD_FOCAL = (1e-3, 1e7)  # no camera in pixels; computing with it overflows
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,10 +47,12 @@ class Overrides:
     ----------
     camera : intrinsics of the images as they are on disk, with or without their size
     depth_scale : units per metre of the depth images
+    topics : of a ROS bag, by "depth", "color" and "camera_info"
     """
 
     camera: PinholeCamera | Intrinsics | None = None
     depth_scale: float | None = None
+    topics: Mapping[str, str] = field(default_factory=dict)
 
 
 def parse_intrinsics(text: str) -> Intrinsics:
@@ -79,6 +87,10 @@ def make_camera(intrinsics: Intrinsics, width: int, height: int, where: str) -> 
     if fy < 0:
         logger.info("%s: fy = %g is taken as %g (the camera's y axis points down)", where, fy, -fy)
         fy = -fy
+    if all(map(math.isfinite, intrinsics)) and not (
+        min(fx, fy) <= 0 or (_ABSURD_FOCAL[0] < min(fx, fy) and max(fx, fy, abs(cx), abs(cy)) < _ABSURD_FOCAL[1])
+    ):
+        raise DatasetError(f"{where}: {fx:g} {fy:g} {cx:g} {cy:g} are no intrinsics, fx fy cx cy in pixels")
     try:
         return PinholeCamera(fx, fy, cx, cy, width, height)
     except InvalidInputError as error:
@@ -106,8 +118,13 @@ def doubt_camera(camera: PinholeCamera) -> str | None:
 
 def scaled_default(intrinsics: Intrinsics, width: int, height: int) -> Intrinsics:
     """Scale intrinsics of 640x480 images to another size, pixel centres as in `PinholeCamera.scaled`."""
+    return resized_intrinsics(intrinsics, (640, 480), (width, height))
+
+
+def resized_intrinsics(intrinsics: Intrinsics, size: tuple[int, int], new_size: tuple[int, int]) -> Intrinsics:
+    """Return the intrinsics of an image of `size` (width, height) after it was resized; as `PinholeCamera.scaled`."""
     fx, fy, cx, cy = intrinsics
-    sx, sy = width / 640, height / 480
+    sx, sy = new_size[0] / size[0], new_size[1] / size[1]
     return fx * sx, fy * sy, (cx + 0.5) * sx - 0.5, (cy + 0.5) * sy - 0.5
 
 
@@ -124,21 +141,60 @@ def read_camera_file(folder: Path) -> CameraFile | None:
     path = folder / CAMERA_FILE
     if not path.is_file():
         return None
-    try:
-        values = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
-        raise DatasetError(f"{path}: not a readable JSON file: {error}") from None
-    if not isinstance(values, dict):
-        raise DatasetError(f"{path}: expected an object with fx, fy, cx, cy, width, height, depth_scale")
-    fx, fy, cx, cy = (_number(path, values, key) for key in ("fx", "fy", "cx", "cy"))
+    values = read_json(path)
+    fx, fy, cx, cy = (require_number(path, values, key) for key in ("fx", "fy", "cx", "cy"))
     size = None
     if "width" in values or "height" in values:
-        size = int(_number(path, values, "width")), int(_number(path, values, "height"))
-    depth_scale = _number(path, values, "depth_scale") if "depth_scale" in values else None
+        size = int(require_number(path, values, "width")), int(require_number(path, values, "height"))
+    depth_scale = require_number(path, values, "depth_scale") if "depth_scale" in values else None
     return CameraFile((fx, fy, cx, cy), size, depth_scale)
 
 
-def _number(path: Path, values: Mapping[str, Any], key: str) -> float:
+def read_json(path: Path) -> dict[str, Any]:
+    """Read a JSON file that holds an object.
+
+    Raises
+    ------
+    DatasetError
+        When it cannot be read, is no JSON, or holds something else.
+    """
+    return parse_json(read_text(path), path)
+
+
+def parse_json(text: str | bytes, where: Path | str) -> dict[str, Any]:
+    """Parse the text of a JSON object as `read_json` does; `where` names it in errors."""
+    try:
+        values = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise DatasetError(f"{where}: not a readable JSON file: {error}") from None
+    if not isinstance(values, dict):
+        raise DatasetError(f"{where}: expected a JSON object, got {type(values).__name__}")
+    return values
+
+
+def read_text(path: Path) -> str:
+    """Read a small text file.
+
+    Raises
+    ------
+    DatasetError
+        When it is missing, no text in UTF-8, or larger than ``MAX_TEXT_BYTES``.
+    """
+    try:
+        with path.open("rb") as stream:
+            data = stream.read(MAX_TEXT_BYTES + 1)
+        text = data.decode("utf-8-sig")
+    except OSError as error:
+        raise DatasetError(f"{path}: cannot be read: {error.strerror or error}") from None
+    except UnicodeDecodeError as error:
+        raise DatasetError(f"{path}: no text in UTF-8 (byte {error.start})") from None
+    if len(data) > MAX_TEXT_BYTES:
+        raise DatasetError(f"{path}: larger than {MAX_TEXT_BYTES >> 20} MB, no description of a recording")
+    return text
+
+
+def require_number(path: Path | str, values: Mapping[str, Any], key: str) -> float:
+    """Return a finite number of a JSON object; raises DatasetError when it is missing or something else."""
     value = values.get(key)
     if not isinstance(value, (int, float)) or isinstance(value, bool) or not math.isfinite(value):
         raise DatasetError(f"{path}: '{key}' must be a number, got {value!r}")

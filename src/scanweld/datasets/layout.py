@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from pathlib import Path
+from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from scanweld.datasets.base import DepthReader, FileSequence, FrameFiles, no_readable_frame
 from scanweld.datasets.images import (
@@ -95,6 +95,20 @@ def first_existing(folder: Path, names: Iterable[str]) -> Path | None:
     return next((folder / name for name in names if (folder / name).exists()), None)
 
 
+def path_inside(folder: Path, name: str, where: str) -> Path:
+    """Return the path of a file that a description names; it must lie within the sequence folder.
+
+    Raises
+    ------
+    DatasetError
+        When the name is absolute or leads out of the folder; `where` says what names it.
+    """
+    is_absolute = PurePosixPath(name).is_absolute() or PureWindowsPath(name).anchor
+    if not name or is_absolute or ".." in PureWindowsPath(name).parts or "\0" in name:
+        raise DatasetError(f"{where}: '{name}' leaves the sequence folder; paths must be inside it")
+    return folder / name
+
+
 def build_sequence(
     folder: Path,
     frames: Sequence[FrameFiles],
@@ -130,45 +144,79 @@ def build_sequence(
         raise DatasetError(f"{folder}: the sequence is empty, no frame was found")
     width, height = _image_size(name, frames, depth_is_image=depth_reader is read_depth_png)
     given = read_camera_file(folder)
-    if given is not None and given.size not in (None, (width, height)):
-        assert given.size is not None
-        raise DatasetError(
-            f"{folder / CAMERA_FILE}: says {given.size[0]}x{given.size[1]}, the images are {width}x{height}"
-        )
-    where = "camera" if overrides.camera is not None else str(folder if given is None else folder / CAMERA_FILE)
-    if isinstance(overrides.camera, PinholeCamera):
-        camera = overrides.camera
-        if (camera.width, camera.height) != (width, height):
-            raise DatasetError(
-                f"{folder}: the images are {width}x{height}, the camera {camera.width}x{camera.height}; "
-                "give the intrinsics of the images on disk, before any scale"
-            )
-    elif overrides.camera is not None:
-        camera = make_camera(overrides.camera, width, height, where)
-    elif given is not None:
-        camera = make_camera(given.intrinsics, width, height, where)
-    elif intrinsics_file is not None:
-        camera = make_camera(intrinsics_file, width, height, where)
-    else:
-        camera = make_camera(scaled_default(intrinsics, width, height), width, height, where)
-    doubt = doubt_camera(camera)
-    if doubt is not None:
-        logger.warning("%s: %s", where, doubt)
+    camera = settle_camera(
+        folder, (width, height), given, overrides, intrinsics=intrinsics, intrinsics_file=intrinsics_file
+    )
     return FileSequence(
         name=name,
         camera=camera,
         frames=tuple(frames),
-        depth_scale=_depth_scale(folder, default_depth_scale, given, overrides),
+        depth_scale=settle_depth_scale(folder, default_depth_scale, given, overrides),
         ground_truth=ground_truth,
         depth_reader=depth_reader,
     )
 
 
-def _depth_scale(folder: Path, default: float, given: CameraFile | None, overrides: Overrides) -> float:
-    """Units per metre: the caller's, else those of camera.json, else the format's."""
+def settle_camera(
+    where: Path,
+    size: tuple[int, int],
+    given: CameraFile | None,
+    overrides: Overrides,
+    *,
+    intrinsics: Intrinsics | None,
+    intrinsics_file: Intrinsics | None = None,
+) -> PinholeCamera:
+    """Return the camera of a sequence: the caller's, else that of camera.json, the format's file, its default.
+
+    Parameters
+    ----------
+    where : the sequence, for messages
+    size : width and height of the images
+    given : camera.json of the sequence
+    overrides : what the caller fixed
+    intrinsics : the format's default for 640x480 images, scaled to their size; None where it has none
+    intrinsics_file : what the sequence itself says, for the images as they are
+
+    Raises
+    ------
+    DatasetError
+        When a size differs from that of the images, the values are no camera, or nothing says what they are.
+    """
+    width, height = size
+    if given is not None and given.size not in (None, size):
+        assert given.size is not None
+        raise DatasetError(
+            f"{where / CAMERA_FILE}: says {given.size[0]}x{given.size[1]}, the images are {width}x{height}"
+        )
+    named = "camera" if overrides.camera is not None else str(where if given is None else where / CAMERA_FILE)
+    if isinstance(overrides.camera, PinholeCamera):
+        camera = overrides.camera
+        if (camera.width, camera.height) != size:
+            raise DatasetError(
+                f"{where}: the images are {width}x{height}, the camera {camera.width}x{camera.height}; "
+                "give the intrinsics of the images on disk, before any scale"
+            )
+    elif overrides.camera is not None:
+        camera = make_camera(overrides.camera, width, height, named)
+    elif given is not None:
+        camera = make_camera(given.intrinsics, width, height, named)
+    elif intrinsics_file is not None:
+        camera = make_camera(intrinsics_file, width, height, named)
+    elif intrinsics is not None:
+        camera = make_camera(scaled_default(intrinsics, width, height), width, height, named)
+    else:
+        raise DatasetError(f"{where}: the intrinsics are not known; pass --camera FX,FY,CX,CY")
+    doubt = doubt_camera(camera)
+    if doubt is not None:
+        logger.warning("%s: %s", named, doubt)
+    return camera
+
+
+def settle_depth_scale(where: Path, default: float, given: CameraFile | None, overrides: Overrides) -> float:
+    """Return the units per metre: the caller's, else those of camera.json, else the format's."""
     stated, source = default, "the format"
     if given is not None and given.depth_scale is not None:
-        stated, source = require_depth_scale(given.depth_scale, str(folder / CAMERA_FILE)), CAMERA_FILE
+        stated, source = require_depth_scale(given.depth_scale, str(where / CAMERA_FILE)), CAMERA_FILE
     if overrides.depth_scale is None:
         return stated
     passed = require_depth_scale(overrides.depth_scale)

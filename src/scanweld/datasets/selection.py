@@ -3,44 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 from scanweld.arrays import Float64
-from scanweld.datasets.base import RgbdSequence, readable_frames
+from scanweld.datasets.base import RgbdSequence, WrappedSequence
 from scanweld.datasets.images import MIN_SIDE_PX, require_scale, resize_color, resize_depth
 from scanweld.errors import InvalidInputError
 from scanweld.geometry.camera import PinholeCamera
 from scanweld.geometry.frame import Frame
-from scanweld.trajectory import Trajectory
 
 
 @dataclass(frozen=True, slots=True)
-class SelectedSequence:
+class SelectedSequence(WrappedSequence):
     """The frames of `base` at `indices`, in that order; timestamps and ground truth stay as they are."""
 
-    base: RgbdSequence
     indices: range
-
-    @property
-    def name(self) -> str:
-        """Name of the whole sequence."""
-        return self.base.name
-
-    @property
-    def camera(self) -> PinholeCamera:
-        """Intrinsics of every frame."""
-        return self.base.camera
-
-    @property
-    def depth_scale(self) -> float:
-        """Units per metre of the stored depth."""
-        return self.base.depth_scale
-
-    @property
-    def ground_truth(self) -> Trajectory | None:
-        """Ground truth of the whole sequence."""
-        return self.base.ground_truth
 
     @property
     def timestamps_s(self) -> Float64:
@@ -54,12 +31,9 @@ class SelectedSequence:
         """Decode the selected frame `index`."""
         return self.base.read(self.indices[index])
 
-    def __iter__(self) -> Iterator[Frame]:
-        return readable_frames(self)
-
 
 @dataclass(frozen=True, slots=True)
-class ResizedSequence:
+class ResizedSequence(WrappedSequence):
     """The frames of `base` with depth, colour and intrinsics resized by `scale`.
 
     Raises
@@ -68,7 +42,6 @@ class ResizedSequence:
         When the scale is not within (0, 4], or leaves fewer than 32 pixels of the shorter side.
     """
 
-    base: RgbdSequence
     scale: float
 
     def __post_init__(self) -> None:
@@ -76,41 +49,15 @@ class ResizedSequence:
         _require_size(self.base.camera, self.scale)
 
     @property
-    def name(self) -> str:
-        """Name of the full-size sequence."""
-        return self.base.name
-
-    @property
     def camera(self) -> PinholeCamera:
         """Intrinsics of the resized images."""
         return self.base.camera.scaled(self.scale)
-
-    @property
-    def depth_scale(self) -> float:
-        """Units per metre of the stored depth."""
-        return self.base.depth_scale
-
-    @property
-    def ground_truth(self) -> Trajectory | None:
-        """Ground truth; it does not depend on the image size."""
-        return self.base.ground_truth
-
-    @property
-    def timestamps_s(self) -> Float64:
-        """Time of every frame (N,) [s]."""
-        return self.base.timestamps_s
-
-    def __len__(self) -> int:
-        return len(self.base)
 
     def read(self, index: int) -> Frame:
         """Decode and resize frame `index`."""
         frame, camera = self.base.read(index), self.camera
         color = None if frame.color is None else resize_color(frame.color, camera.shape)
         return Frame(frame.timestamp_s, resize_depth(frame.depth_m, camera.shape), color, camera)
-
-    def __iter__(self) -> Iterator[Frame]:
-        return readable_frames(self)
 
 
 def _require_size(camera: PinholeCamera, scale: float) -> None:

@@ -30,12 +30,12 @@ _NAME = re.compile(r"frame-(\d{1,15})\.(color|depth|pose)\.(png|jpg|jpeg|txt)")
 
 def is_seven_scenes(folder: Path) -> bool:
     """Whether the folder has a file named as this format's images."""
-    return bool(_files(folder, "depth") or _files(folder, "color"))
+    return bool(frame_files(folder, "depth") or frame_files(folder, "color"))
 
 
 def open_seven_scenes(folder: Path, overrides: Overrides) -> FileSequence:
     """Open a sequence in the 7-Scenes layout; raises DatasetError when it cannot be used."""
-    pairs = pair_by_number(folder, _files(folder, "depth"), _files(folder, "color"))
+    pairs = pair_by_number(folder, frame_files(folder, "depth"), frame_files(folder, "color"))
     matrix = first_existing(folder, ("intrinsics.K.txt", "camera-intrinsics.txt"))
     return build_sequence(
         folder,
@@ -44,11 +44,12 @@ def open_seven_scenes(folder: Path, overrides: Overrides) -> FileSequence:
         intrinsics=INTRINSICS,
         default_depth_scale=1000,
         intrinsics_file=None if matrix is None else read_intrinsics_matrix(matrix),
-        ground_truth=_ground_truth(folder),
+        ground_truth=frame_poses(folder),
     )
 
 
-def _files(folder: Path, kind: str) -> dict[int, Path]:
+def frame_files(folder: Path, kind: str) -> dict[int, Path]:
+    """Return the files of a kind, "color", "depth" or "pose", by number, ascending."""
     found = {}
     for path in folder.iterdir():
         match = _NAME.fullmatch(path.name)
@@ -57,8 +58,9 @@ def _files(folder: Path, kind: str) -> dict[int, Path]:
     return dict(sorted(found.items()))
 
 
-def _ground_truth(folder: Path) -> Trajectory | None:
-    poses = {number: read_pose(path) for number, path in _files(folder, "pose").items()}
+def frame_poses(folder: Path) -> Trajectory | None:
+    """Return the finite poses, frame n at n / 30 s, or None without any; raises FileFormatError for a damaged one."""
+    poses = {number: read_pose(path) for number, path in frame_files(folder, "pose").items()}
     known = {number: pose for number, pose in poses.items() if pose is not None}
     if len(known) < len(poses):
         logger.warning(

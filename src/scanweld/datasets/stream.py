@@ -1,11 +1,12 @@
-"""Decode ahead of the consumer, on threads of its own, in order."""
+"""Decode ahead of the consumer, and prepare what it asks for, on threads of its own, in order."""
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import Any
 
 from scanweld.datasets.base import RgbdSequence, no_readable_frame
 from scanweld.errors import InvalidInputError, UnreadableFrameError
@@ -22,15 +23,23 @@ class FrameRecord:
     timestamp_s : [s]
     frame : the frame, or None where it cannot be decoded
     error : why it cannot, else ""
+    prepared : what `prepare` made of the frame; None where there is neither
     """
 
     index: int
     timestamp_s: float
     frame: Frame | None
     error: str = ""
+    prepared: Any = None
 
 
-def stream(sequence: RgbdSequence, lookahead: int = 4, *, num_threads: int = 1) -> Generator[FrameRecord]:
+def stream(
+    sequence: RgbdSequence,
+    lookahead: int = 4,
+    *,
+    num_threads: int = 1,
+    prepare: Callable[[Frame], Any] | None = None,
+) -> Generator[FrameRecord]:
     """Yield a record for every frame, in order, while the next `lookahead` frames are being decoded.
 
     Decoders release the GIL, so the consumer computes meanwhile. At most `lookahead` frames wait in memory.
@@ -41,27 +50,32 @@ def stream(sequence: RgbdSequence, lookahead: int = 4, *, num_threads: int = 1) 
     sequence : what to read
     lookahead : frames decoded ahead, at least 1
     num_threads : decoding threads, at least 1; the order does not depend on it
+    prepare : called with each frame on its decoding thread, so it must depend on the frame alone and not wait for
+        the consumer; what it returns waits in memory with the frame
 
     Raises
     ------
     InvalidInputError
         When `lookahead` or `num_threads` is below 1.
     DatasetError
-        At the end, when no frame at all could be decoded, and whatever else reading raises, at its frame.
+        At the end, when no frame at all could be decoded, and whatever else reading or preparing raises, at its frame.
     """
     if lookahead < 1 or num_threads < 1:
         raise InvalidInputError(f"stream: expected at least one frame and thread, got {lookahead} and {num_threads}")
-    return _records(sequence, lookahead, num_threads)
+    return _records(sequence, lookahead, num_threads, prepare)
 
 
-def _records(sequence: RgbdSequence, lookahead: int, num_threads: int) -> Generator[FrameRecord]:
+def _records(
+    sequence: RgbdSequence, lookahead: int, num_threads: int, prepare: Callable[[Frame], Any] | None
+) -> Generator[FrameRecord]:
     timestamps_s = sequence.timestamps_s.tolist()
 
     def record(index: int) -> FrameRecord:
         try:
-            return FrameRecord(index, timestamps_s[index], sequence.read(index))
+            frame = sequence.read(index)
         except UnreadableFrameError as error:
             return FrameRecord(index, timestamps_s[index], None, str(error))
+        return FrameRecord(index, timestamps_s[index], frame, prepared=prepare(frame) if prepare else None)
 
     pending: deque[Future[FrameRecord]] = deque()
     first_fault, num_read = "", 0

@@ -14,13 +14,15 @@ from __future__ import annotations
 
 import logging
 import re
-from pathlib import Path, PurePosixPath, PureWindowsPath
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
 from scanweld.datasets.base import FileSequence, FrameFiles
+from scanweld.datasets.gyroscope import read_gyroscope
 from scanweld.datasets.intrinsics import CAMERA_FILE, Intrinsics, Overrides
-from scanweld.datasets.layout import build_sequence, first_existing
+from scanweld.datasets.layout import build_sequence, first_existing, path_inside
 from scanweld.errors import DatasetError
 from scanweld.io.timestamps import MAX_TIME_DIFFERENCE_S, associate_times
 from scanweld.io.trajectory_files import read_trajectory
@@ -46,15 +48,24 @@ def is_tum(folder: Path) -> bool:
 
 def open_tum(folder: Path, overrides: Overrides) -> FileSequence:
     """Open a sequence in the TUM RGB-D layout; raises DatasetError when it cannot be used."""
+    return open_listed(folder, overrides, _intrinsics(folder, overrides))
+
+
+def open_listed(
+    folder: Path, overrides: Overrides, intrinsics: Intrinsics, *, intrinsics_file: Intrinsics | None = None
+) -> FileSequence:
+    """Open a sequence in this layout; intrinsics are those of the camera, as for `build_sequence`."""
     truth = first_existing(folder, ("groundtruth.txt",))
-    return build_sequence(
+    sequence = build_sequence(
         folder,
         listed_frames(folder),
         overrides=overrides,
-        intrinsics=_intrinsics(folder, overrides),
+        intrinsics=intrinsics,
+        intrinsics_file=intrinsics_file,
         default_depth_scale=DEPTH_SCALE,
         ground_truth=None if truth is None else read_trajectory(truth, format="tum"),
     )
+    return replace(sequence, gyroscope=read_gyroscope(folder))
 
 
 def _intrinsics(folder: Path, overrides: Overrides) -> Intrinsics:
@@ -124,7 +135,7 @@ def _read_list(path: Path) -> list[tuple[float, Path]]:
         if len(words) != 2:
             raise DatasetError(f"{path}, line {number}: expected `timestamp path`, got {line[:60]!r}")
         time = _time(path, number, words[0], entries[-1][0] if entries else None)
-        entries.append((time, _inside(path, number, words[1].strip())))
+        entries.append((time, path_inside(path.parent, words[1].strip(), f"{path}, line {number}")))
     return entries
 
 
@@ -138,7 +149,8 @@ def _read_associations(path: Path) -> list[FrameFiles]:
         first, second = (0, 2) if "depth" in words[1].lower() else (2, 0)
         time = _time(path, number, words[first], frames[-1].timestamp_s if frames else None)
         _time(path, number, words[second], None)
-        depth, color = _inside(path, number, words[first + 1]), _inside(path, number, words[second + 1])
+        where = f"{path}, line {number}"
+        depth, color = (path_inside(path.parent, words[k + 1], where) for k in (first, second))
         frames.append(FrameFiles(time, depth, color))
     return frames
 
@@ -163,11 +175,3 @@ def _time(path: Path, number: int, word: str, before_s: float | None) -> float:
         what, fix = ("repeats", "remove one of the two") if time == before_s else ("is before", "sort the file")
         raise DatasetError(f"{path}, line {number}: timestamp {time:.6f} {what} {before_s:.6f} above it; {fix}")
     return time
-
-
-def _inside(path: Path, number: int, name: str) -> Path:
-    """Path of a listed file; it must lie within the sequence folder."""
-    is_absolute = PurePosixPath(name).is_absolute() or PureWindowsPath(name).anchor
-    if is_absolute or ".." in PureWindowsPath(name).parts or "\0" in name:
-        raise DatasetError(f"{path}, line {number}: '{name}' leaves the sequence folder; paths must be inside it")
-    return path.parent / name

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
-from scanweld.arrays import Array, Float32
+from scanweld.arrays import Array, Float32, UInt8
 from scanweld.config import check_ranges, setting
 from scanweld.errors import InvalidInputError
 from scanweld.geometry import kernels
@@ -72,10 +73,22 @@ class SurfaceLevel:
 
 @dataclass(frozen=True, slots=True)
 class SurfacePyramid:
-    """A frame and its surfaces, finest level first."""
+    """A frame and its surfaces, finest level first.
+
+    Attributes
+    ----------
+    frame : what was seen
+    levels : its surfaces
+    grey : (H, W) float32, 0..255, brightness of the finest level; None where there is none to track with
+    """
 
     frame: Frame
     levels: tuple[SurfaceLevel, ...]
+    grey: Float32 | None = None
+
+
+GRAIN_PX = 1 << 16
+"""Pixels that a thread gets at least: fewer are worked off (in a quarter of a millisecond) before it has woken up."""
 
 
 def build_pyramid(frame: Frame, config: SurfaceConfig | None = None) -> SurfacePyramid:
@@ -83,7 +96,7 @@ def build_pyramid(frame: Frame, config: SurfaceConfig | None = None) -> SurfaceP
     config = config or SurfaceConfig()
     depth = frame.depth_m
     if float(depth.max(initial=0.0)) > config.max_depth_m:
-        depth = np.where(depth > config.max_depth_m, np.float32(0), depth)
+        depth = depth * (depth <= np.float32(config.max_depth_m))
     scale = noise_scale(depth, config)
     config = replace(config, noise_floor_m=config.noise_floor_m * scale, noise_growth=config.noise_growth * scale)
     camera = frame.camera
@@ -96,7 +109,15 @@ def build_pyramid(frame: Frame, config: SurfaceConfig | None = None) -> SurfaceP
         smooth = bilateral_filter(depth, config) if config.bilateral and level == 0 else depth
         levels.append(SurfaceLevel(camera, smooth, surface_image(smooth, camera, config)))
         depth = smooth
-    return SurfacePyramid(frame, tuple(levels))
+    return SurfacePyramid(frame, tuple(levels), None if frame.color is None else luminance(frame.color))
+
+
+def luminance(color: UInt8) -> Float32:
+    """Return the grey image (H, W) float32, 0..255, of a colour image (H, W, 3) uint8."""
+    rgb = as_kernel_input(color, np.uint8).reshape(len(color), -1)
+    grey = np.empty(color.shape[:2], np.float32)
+    run_ranges(len(grey), lambda start, stop: kernels.grey_rows(start, stop, rgb, grey), grain=_grain(grey))
+    return grey
 
 
 def noise_scale(depth_m: Float32, config: SurfaceConfig) -> float:
@@ -105,17 +126,13 @@ def noise_scale(depth_m: Float32, config: SurfaceConfig) -> float:
     Inverse depth is linear along rows and columns of a plane, so the bends between three pixels three apart are noise
     almost everywhere; their median is compared with the model's (median absolute deviation).
     """
-    ratios = []
-    for image in (depth_m[::8], depth_m.T[::8]):
-        before, centre, behind = image[:, :-6:4], image[:, 3:-3:4], image[:, 6::4]
-        valid = (before > 0) & (centre > 0) & (behind > 0)
-        a, z, b = before[valid], centre[valid], behind[valid]
-        sigma = config.noise_floor_m + config.noise_growth * (z - config.noise_nearest_m) ** 2
-        ratios.append(np.abs(1 / a + 1 / b - 2 / z) * z * z / (np.sqrt(np.float32(6)) * sigma))
-    together = np.concatenate(ratios)
-    if len(together) < 100:
+    depth = as_kernel_input(depth_m, np.float32)
+    ratios = np.empty(depth.size // 8 + sum(depth.shape), np.float32)
+    count = kernels.bend_ratios(depth, config.noise, ratios)
+    if count < 100:
         return 1.0
-    return float(np.clip(1.4826 * np.median(together), 1.0, config.max_noise_scale))
+    typical = 1.4826 * float(np.median(ratios[:count])) / math.sqrt(6)
+    return min(max(typical, 1.0), config.max_noise_scale)
 
 
 def surface_image(depth_m: Float32, camera: PinholeCamera, config: SurfaceConfig) -> Float32:
@@ -124,13 +141,14 @@ def surface_image(depth_m: Float32, camera: PinholeCamera, config: SurfaceConfig
         raise InvalidInputError(f"depth has shape {depth_m.shape}, the camera {camera.shape}")
     depth = as_kernel_input(depth_m, np.float32)
     surface = np.empty((*depth.shape, 8), np.float32)
+    values = surface.reshape(len(surface), -1)
     intrinsics = intrinsics_array(camera)
     noise, radius, cosine = config.noise, config.normal_radius, np.float32(config.min_cosine)
 
     def rows(start: int, stop: int) -> None:
-        kernels.surface_rows(start, stop, depth, intrinsics, radius, noise, cosine, surface)
+        kernels.surface_rows(start, stop, depth, intrinsics, radius, noise, cosine, values)
 
-    run_ranges(depth.shape[0], rows)
+    run_ranges(depth.shape[0], rows, grain=_grain(depth))
     return surface
 
 
@@ -142,7 +160,9 @@ def half_size(depth_m: Float32, camera: PinholeCamera, relative_band: float = 0.
     depth = as_kernel_input(depth_m, np.float32)
     half = np.empty((depth.shape[0] // 2, depth.shape[1] // 2), np.float32)
     band = np.float32(relative_band)
-    run_ranges(half.shape[0], lambda start, stop: kernels.halve_depth(start, stop, depth, band, half))
+    run_ranges(
+        half.shape[0], lambda start, stop: kernels.halve_depth(start, stop, depth, band, half), grain=_grain(half)
+    )
     smaller = PinholeCamera(
         camera.fx / 2,
         camera.fy / 2,
@@ -168,6 +188,11 @@ def bilateral_filter(
 
     run_ranges(depth.shape[0], rows)
     return smooth
+
+
+def _grain(image: Array) -> int:
+    """Rows of an image that a thread gets at least."""
+    return max(1, GRAIN_PX // int(image.shape[1]))
 
 
 def as_kernel_input(image: Array, dtype: npt.DTypeLike) -> Array:

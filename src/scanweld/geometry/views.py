@@ -4,11 +4,22 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from scanweld.arrays import Float32, Float64, Int32
+import numpy as np
+
+from scanweld.arrays import Float32, Float64, Int32, Int64
 from scanweld.geometry.camera import PinholeCamera
 
 
 @dataclass(frozen=True, slots=True)
+class ModelRows:
+    """Some of the surfels that a camera sees: positions_m, normals (3, M) float32; confidences, intensities (M,)."""
+
+    positions_m: Float32
+    normals: Float32
+    confidences: Float32
+    intensities: Float32 | None = None
+
+
 class ModelView:
     """The surfels that a camera sees, one at most per pixel, as rows of equal length N.
 
@@ -21,7 +32,7 @@ class ModelView:
     positions_m : (3, N) float32, world frame [m]
     normals : (3, N) float32, world frame, unit, towards the camera
     confidences : (N,) float32
-    index_map : (H, W) int32, the surfel behind each pixel, -1 where none
+    index_map : (H, W) int32, the surfel behind each pixel, -1 where none; its numbers mean something to the map only
     intensities : (N,) float32, luminance 0..255, or None where the mapper does not give it
     stable_confidence : from this confidence on a surfel is stable
     """
@@ -32,11 +43,33 @@ class ModelView:
     normals: Float32
     confidences: Float32
     index_map: Int32
-    stable_confidence: float = 0.0
-    intensities: Float32 | None = None
+    stable_confidence: float
+    intensities: Float32 | None
+
+    def __init__(
+        self,
+        T_world_camera: Float64,
+        camera: PinholeCamera,
+        positions_m: Float32,
+        normals: Float32,
+        confidences: Float32,
+        index_map: Int32,
+        stable_confidence: float = 0.0,
+        intensities: Float32 | None = None,
+    ) -> None:
+        self.T_world_camera, self.camera, self.index_map = T_world_camera, camera, index_map
+        self.positions_m, self.normals, self.confidences = positions_m, normals, confidences
+        self.stable_confidence, self.intensities = stable_confidence, intensities
 
     def __len__(self) -> int:
         return int(self.positions_m.shape[1])
+
+    def take(self, rows: Int64) -> ModelRows:
+        """Return some of the rows (M,), in the given order."""
+        return ModelRows(
+            np.take(self.positions_m, rows, axis=1), np.take(self.normals, rows, axis=1), self.confidences[rows],
+            None if self.intensities is None else self.intensities[rows],
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)

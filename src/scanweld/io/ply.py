@@ -92,6 +92,17 @@ def read_ply(path: str | os.PathLike[str]) -> PointCloud:
     FileFormatError
         When the file is missing, is no PLY file, is shorter than its header promises, or has no x and y.
     """
+    return cloud_from_columns(Path(path), read_ply_columns(path))
+
+
+def read_ply_columns(path: str | os.PathLike[str]) -> dict[str, Array]:
+    """Read every single-valued property of a PLY file's vertices, by name, as it is stored.
+
+    Raises
+    ------
+    FileFormatError
+        As :func:`read_ply`, but for what the columns mean.
+    """
     file = Path(path)
     try:
         with file.open("rb") as stream:
@@ -101,8 +112,7 @@ def read_ply(path: str | os.PathLike[str]) -> PointCloud:
             body = stream.read()
     except OSError as error:
         raise FileFormatError(f"{file}: {error.strerror or error}") from None
-    columns = (_read_binary if header.byte_order else _read_ascii)(file, header, body)
-    return cloud_from_columns(file, columns)
+    return (_read_binary if header.byte_order else _read_ascii)(file, header, body)
 
 
 def _read_header(path: Path, head: bytes) -> _Header:

@@ -209,7 +209,8 @@ def _parse_tum(path: Path, rows: _Rows) -> _Parsed:
     table = np.array([values for _, values in rows])
     lines = [line for line, _ in rows]
     _require_finite(path, lines, table)
-    norms = np.linalg.norm(table[:, 4:], axis=1)
+    with np.errstate(over="ignore"):  # an absurd entry is refused below
+        norms = np.linalg.norm(table[:, 4:], axis=1)
     wrong = np.abs(norms - 1) > POSE_TOLERANCE
     if wrong.any():
         at = int(np.argmax(wrong))
@@ -267,9 +268,11 @@ def _rigid(path: Path, lines: list[int], matrices: Float64) -> Float64:
     poses = np.tile(np.eye(4), (len(matrices), 1, 1))
     poses[:, : matrices.shape[1]] = matrices
     rotations = poses[:, :3, :3]
-    defect = np.abs(np.swapaxes(rotations, 1, 2) @ rotations - np.eye(3)).max(axis=(1, 2))
+    with np.errstate(over="ignore", invalid="ignore"):  # absurd entries are refused below
+        defect = np.abs(np.swapaxes(rotations, 1, 2) @ rotations - np.eye(3)).max(axis=(1, 2))
+        mirrored = ~(np.linalg.det(rotations) > 0)
     last_row = np.abs(poses[:, 3] - [0, 0, 0, 1]).max(axis=1)
-    wrong = (defect > POSE_TOLERANCE) | (np.linalg.det(rotations) < 0) | (last_row > POSE_TOLERANCE)
+    wrong = ~(defect <= POSE_TOLERANCE) | mirrored | (last_row > POSE_TOLERANCE)
     if wrong.any():
         at = int(np.argmax(wrong))
         raise FileFormatError(

@@ -9,17 +9,17 @@ with ``SyntheticSequence(config, trajectory=...)``. For every n-th frame there i
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
-from scanweld.arrays import Float64, as_transform
-from scanweld.datasets.base import RgbdSequence, readable_frames
+from scanweld.arrays import as_transform
+from scanweld.datasets.base import RgbdSequence, WrappedSequence
+from scanweld.datasets.gyroscope import Gyroscope
 from scanweld.errors import InvalidInputError, UnreadableFrameError
 from scanweld.geometry import se3
-from scanweld.geometry.camera import PinholeCamera
 from scanweld.geometry.frame import Frame
 from scanweld.trajectory import Trajectory
 
@@ -28,46 +28,63 @@ Alteration = Callable[[int, Frame], Frame]
 
 
 @dataclass(frozen=True, slots=True)
-class AlteredSequence:
+class AlteredSequence(WrappedSequence):
     """The frames of `base`, each passed through `alter` when it is read."""
 
-    base: RgbdSequence
     alter: Alteration
-
-    @property
-    def name(self) -> str:
-        """Name of the sequence underneath."""
-        return self.base.name
-
-    @property
-    def camera(self) -> PinholeCamera:
-        """Intrinsics of every frame."""
-        return self.base.camera
-
-    @property
-    def depth_scale(self) -> float:
-        """Units per metre of the stored depth."""
-        return self.base.depth_scale
-
-    @property
-    def ground_truth(self) -> Trajectory | None:
-        """True poses; what is done to the images does not move the camera."""
-        return self.base.ground_truth
-
-    @property
-    def timestamps_s(self) -> Float64:
-        """Time of every frame (N,) [s]."""
-        return self.base.timestamps_s
-
-    def __len__(self) -> int:
-        return len(self.base)
 
     def read(self, index: int) -> Frame:
         """Read and alter frame `index`."""
         return self.alter(index, self.base.read(index))
 
-    def __iter__(self) -> Iterator[Frame]:
-        return readable_frames(self)
+
+@dataclass(frozen=True, slots=True)
+class GyroscopeSequence(WrappedSequence):
+    """The frames of `base` with a gyroscope beside them."""
+
+    measured: Gyroscope | None
+
+    @property
+    def gyroscope(self) -> Gyroscope | None:
+        """What it measured."""
+        return self.measured
+
+
+def simulate_gyroscope(
+    trajectory: Trajectory,
+    *,
+    rate_hz: float = 400.0,
+    noise_rad_s: float = 0.005,
+    bias_rad_s: npt.ArrayLike = (0.0, 0.0, 0.0),
+    R_camera_imu: npt.ArrayLike | None = None,
+    seed: int = 0,
+) -> Gyroscope:
+    """Return what a gyroscope on the camera of a path measures: exact rates, a bias and white noise.
+
+    Between two poses the camera turns evenly. A sensor that is worn on the camera at an angle has its `R_camera_imu`.
+
+    Parameters
+    ----------
+    trajectory : T_world_camera, at least two poses
+    rate_hz : about so many samples a second, as many in each interval between poses
+    noise_rad_s : standard deviation of each sample; good MEMS sensors have 0.005 at 400 Hz
+    bias_rad_s : (3,), added to every sample, axes of the sensor
+    R_camera_imu : (3, 3), from the axes of the sensor to those of the camera; identity by default
+    seed : of the noise
+    """
+    R_axes = np.eye(3) if R_camera_imu is None else np.asarray(R_camera_imu, np.float64)
+    R, times = trajectory.T_world_camera[:, :3, :3], trajectory.timestamps_s
+    elapsed = np.diff(times)
+    rates = se3.log_so3(np.swapaxes(R[:-1], 1, 2) @ R[1:]) / elapsed[:, None]
+    count = max(2, round(float(np.median(elapsed)) * rate_hz))
+    within = np.linspace(1e-3, 1 - 1e-3, count)  # to both ends: rates that leap from pose to pose are not smoothed
+    at = (times[:-1, None] + elapsed[:, None] * within).ravel()
+    samples = np.repeat(rates, count, axis=0) @ R_axes + np.asarray(bias_rad_s, np.float64)
+    noise = np.random.default_rng(seed).normal(0.0, noise_rad_s, samples.shape)
+    # It was on before the first image and after the last one.
+    whole = np.concatenate([[times[0] - 1e-3], at, [times[-1] + 1e-3]])
+    samples = (samples + noise)[[0, *range(len(samples)), -1]]
+    return Gyroscope(whole, samples, R_axes)
 
 
 def blackout(sequence: RgbdSequence, start: int, count: int = 1) -> AlteredSequence:
