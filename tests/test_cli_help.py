@@ -15,10 +15,14 @@ from scanweld.cli.app import app
 OPTIONS = {
     "demo": "--out --frames --threads --json",
     "slam": "--out --format --camera --depth-scale --frames --scale --poses --config --set --threads --force --json "
-    "--tracked-only",
+    "--tracked-only --topics --refine --calibrate",
     "register": "--method --scale --init --global --voxel --max-distance --set --threads --explain --plot --out --json",
     "evaluate": "--align --json --plot",
     "render": "--out --scene --path --path-frame --noise --frames --size --fps --seed --force",
+    "report": "--truth --out",
+    "mesh": "--out --voxel --frames --depth-max --fill-holes --from-surfels --splat --memory --threads --json",
+    "bench": "--frames --sizes --peer-python --plot --threads --json",
+    "warmup": "--json",
 }
 """What every command must offer."""
 
@@ -45,6 +49,14 @@ def test_help_names_every_option(command: str, columns: int) -> None:
     done = scanweld(command, "--help", columns=columns)
     assert (done.returncode, done.stderr) == (0, "")
     assert set(OPTIONS[command].split()) <= set(re.findall(r"--[a-z-]+", done.stdout))
+
+
+def test_help_names_every_format() -> None:
+    """The command line does not load the readers to show its help."""
+    from scanweld.datasets.open import FORMATS
+
+    shown = scanweld("slam", "--help", columns=200).stdout
+    assert [row.name for row in FORMATS if row.name not in shown] == []
 
 
 def test_help_fits_a_narrow_terminal() -> None:

@@ -421,7 +421,7 @@ class TestDemo:
         assert code == 0
         assert files_of(Path("scanweld-demo")) == FILES
         assert (asked[0].scene, asked[0].noise, asked[0].frames) == ("room", "kinect", 4)
-        for name in ("renders/overview-rgb.png", "plots/trajectory.png"):
+        for name in ("report.html", "renders/overview-rgb.png"):
             assert f"scanweld-demo/{name}" in out
         code, out, _ = scanweld("demo", "--frames", 5, "--json")  # replaces its own folder
         assert code == 0

@@ -8,6 +8,7 @@ import hypothesis.strategies as st
 import numpy as np
 import pytest
 from hypothesis import given, settings
+from scipy.spatial import cKDTree
 
 import scanweld as sw
 from rendered import CAMERA, frame_of, plane_depth, rendered
@@ -41,7 +42,17 @@ def content(surfels: sw.SurfelMap) -> bytes:
 def values_of(surfels: sw.SurfelMap) -> dict[str, np.ndarray]:
     """What the map holds, colours with their fractions."""
     values = {name: np.array(getattr(surfels, name)).astype(np.float64) for name in ALL}
-    return values | {"colors": surfels.arrays.colors[:, : len(surfels)].astype(np.float64)}
+    return values | {"colors": surfels.table()["colors"].astype(np.float64)}
+
+
+def matched(
+    values: dict[str, np.ndarray], expected: dict[str, np.ndarray], within_m: float = 1e-4
+) -> dict[str, np.ndarray]:
+    """Put surfels into the order of the expected ones, which lie this near to them."""
+    distance, order = cKDTree(values["positions_m"].T).query(expected["positions_m"].T)
+    assert distance.max(initial=0) < within_m
+    assert len(np.unique(order)) == len(order)
+    return {name: column[..., order] for name, column in values.items()}
 
 
 class TestWeight:
@@ -72,7 +83,8 @@ def reference_fuse(
     """One pixel at a time: what the map holds after a frame."""
     level, camera = pyramid.levels[0], pyramid.frame.camera
     surface, alpha = level.surface.astype(np.float64), radial_weight(camera).astype(np.float64)
-    index_map, _ = render_index_map(surfels, find_candidates(surfels, T, camera), T, camera, config.stable_confidence)
+    seen = render_index_map(surfels, find_candidates(surfels, T, camera), T, camera, config.stable_confidence)
+    index_map = np.where(seen.numbers >= 0, surfels.rows_of(np.maximum(seen.numbers, 0)), -1)
     old = values_of(surfels)
     new = {name: values.copy() for name, values in old.items()}
     appended: dict[str, list[object]] = {name: [] for name in ALL}
@@ -151,10 +163,10 @@ class TestAgainstNumpy:
         counts = mapper.fuse(pyramid, T)
         assert len(mapper.map) == expected["radii_m"].shape[0]
         assert counts.appended == len(mapper.map) - before > 20
-        changed = mapper.map.confidences[:before] - confidences
+        changed = expected["confidences"][:before] - confidences
         assert (changed > 0).sum() > 100
         assert (changed < 0).sum() > 3
-        for name, values in values_of(mapper.map).items():
+        for name, values in matched(values_of(mapper.map), expected).items():
             np.testing.assert_allclose(values, expected[name], atol=1e-3 if name == "colors" else 2e-5, err_msg=name)
 
     def test_rendered_frames_in_turn(self) -> None:
@@ -182,15 +194,18 @@ class TestMerging:
         forth, back = mapper_with(first, second).map, mapper_with(second, first).map
         if len(forth) != len(back):  # the walls are more than a gate apart at the side: surfels were added
             return
-        np.testing.assert_allclose(forth.positions_m, back.positions_m, atol=2e-6)
-        np.testing.assert_allclose(forth.normals, back.normals, atol=2e-6)
-        np.testing.assert_allclose(forth.confidences, back.confidences, rtol=1e-6)
-        single = mapper_with(first).map
-        if len(single) == len(forth):
-            assert forth.confidences.sum() == pytest.approx(2 * single.confidences.sum(), rel=1e-5)
-            middle = (single.positions_m + mapper_with(second).map.positions_m) / 2
-            np.testing.assert_allclose(forth.positions_m, middle, atol=2e-6)
-            assert np.abs(forth.colors.astype(int) - (colors[0] + colors[1]) / 2).max() <= 0.51
+        forth, back = values_of(forth), matched(values_of(back), values_of(forth))
+        np.testing.assert_allclose(forth["positions_m"], back["positions_m"], atol=2e-6)
+        np.testing.assert_allclose(forth["normals"], back["normals"], atol=2e-6)
+        np.testing.assert_allclose(forth["confidences"], back["confidences"], rtol=1e-6)
+        single = values_of(mapper_with(first).map)
+        if len(single["radii_m"]) == len(forth["radii_m"]):
+            assert forth["confidences"].sum() == pytest.approx(2 * single["confidences"].sum(), rel=1e-5)
+            # Pixels are 37 mm apart; the two walls at most 20 mm, and the mean of both half of that from each.
+            one = matched(single, forth, within_m=0.015)["positions_m"]
+            other = matched(values_of(mapper_with(second).map), forth, within_m=0.015)["positions_m"]
+            np.testing.assert_allclose(forth["positions_m"], (one + other) / 2, atol=2e-6)
+            assert np.abs(forth["colors"] - (colors[0] + colors[1]) / 2).max() <= 0.51
 
     def test_mean_of_many_and_normals_stay_unit(self) -> None:
         """Ten walls within the gate: the map is at their mean, the confidence ten times the first."""
@@ -256,7 +271,7 @@ class TestMerging:
 
         frame = rendered(count=40).frames[0]
         expected = mapper_with(sw.build_pyramid(frame)).map
-        compiled = len(kernels.append_rows.signatures), len(kernels.merge_rows.signatures)
+        compiled = len(kernels.new_surfels.signatures), len(kernels.merge_pages.signatures)
         color, depth = frame.color.copy(), frame.depth_m.copy()
         if layout == "read-only":
             color.flags.writeable = depth.flags.writeable = False
@@ -266,7 +281,7 @@ class TestMerging:
             color = color[..., ::-1].copy()[..., ::-1]
         mapper = mapper_with(*[sw.build_pyramid(replace(frame, color=color, depth_m=depth))] * 2)
         np.testing.assert_array_equal(mapper.map.colors, expected.colors)
-        assert (len(kernels.append_rows.signatures), len(kernels.merge_rows.signatures)) == compiled
+        assert (len(kernels.new_surfels.signatures), len(kernels.merge_pages.signatures)) == compiled
 
     def test_frame_without_colour_is_grey(self) -> None:
         frame = replace(rendered(count=40).frames[0], color=None)
@@ -281,6 +296,20 @@ class TestMerging:
         elsewhere = se3.exp([0, 0, 0, 0, np.radians(30), 0])
         assert len(mapper.view(elsewhere, camera)) < before / 2
         assert mapper.fuse(pyramid, np.eye(4)).appended < 0.01 * before
+
+
+def test_view_reaches_further_than_anything_was_measured() -> None:
+    """From 12 m on it is one and a half times the largest depth; what is further away is not even looked at."""
+    mapper = sw.SurfelMapper()
+    far = np.array([[0.0], [0.0], [13.0]], np.float32)
+    mapper.map.append(far, -far / 13, np.zeros((3, 1)), np.ones(1, np.float32), np.ones(1, np.float32), 0)
+    assert len(mapper.view(np.eye(4), SMALL)) == 0
+    frame = frame_of(plane_depth((0, 0, 1), 9.0, SMALL), camera=SMALL)
+    mapper.fuse(sw.build_pyramid(frame, sw.SurfaceConfig(max_depth_m=20.0)), np.eye(4))
+    axis = mapper.view(se3.exp([0, 0, -0.4, 0, 0, 0]), SMALL)
+    assert (axis.positions_m[2] > 12).sum() == 0  # hidden by the wall
+    mapper.map.remove(mapper.map.positions_m[2] < 10)
+    assert len(mapper.view(se3.exp([0, 0, -0.4, 0, 0, 0]), SMALL)) == 1
 
 
 class TestFreeSpace:
@@ -332,30 +361,28 @@ class TestFreeSpace:
         assert np.isfinite(mapper.map.positions_m).all()
 
 
-NOTHING_SEEN = np.full((1, 1), -1, np.int32)
-"""An index map without surfels."""
-
-
 class TestRemoval:
-    def test_what_is_in_view_comes_first_in_the_order_of_the_image(self) -> None:
-        """Six stable surfels, the fourth doomed, numbers 5, 3 and 2 in view, row by row: 5 2, then 0 1 4."""
+    def test_only_pages_with_a_reason_are_looked_at(self) -> None:
+        """Of two cells with a surfel that has nothing left, the one that fusion marked is cleaned."""
         surfels = sw.SurfelMap()
-        names = np.arange(6, dtype=np.float32)
-        vectors = np.stack([names, names, names])
-        confidence = np.array([9, 9, 9, 0, 9, 9], np.float32)
-        surfels.append(vectors, vectors, vectors, names + 1, confidence, 0)
-        assert tidy(surfels, np.array([[-1, 5], [3, 2]], np.int32), 1, FusionConfig()) == 1
-        np.testing.assert_array_equal(surfels.positions_m[0], [5, 2, 0, 1, 4])
-        np.testing.assert_array_equal(surfels.radii_m, [6, 3, 1, 2, 5])
+        vectors = np.array([[0.1, 0.1, 9.0, 9.0]] * 3, np.float32)
+        confidence = np.array([9, 0, 9, 0], np.float32)
+        surfels.append(vectors, vectors, vectors, confidence + 1, confidence, 0)
+        pages = surfels.pages
+        pages.probation[pages.live] = 0x7FFFFFFF
+        pages.dirty[pages.live[1]] = 1
+        assert tidy(surfels, 1, FusionConfig(clean_interval=8)) == 0
+        assert tidy(surfels, 8, FusionConfig(clean_interval=8)) == 1
+        np.testing.assert_array_equal(surfels.positions_m[0][surfels.confidences == 0], np.float32([0.1]))
 
     def test_unstable_surfels_go_after_their_time_and_stable_ones_stay(self) -> None:
-        config = FusionConfig(stable_confidence=2.0, unstable_frames=10)
+        config = FusionConfig(stable_confidence=2.0, unstable_frames=10, clean_interval=1)
         surfels = sw.SurfelMap()
         confidence = np.array([1.9, 2.0, 1.0, 0.0, 50.0], np.float32)
         vectors = np.zeros((3, 5), np.float32)
         surfels.append(vectors, vectors, vectors, confidence, confidence, 0)
-        assert tidy(surfels, NOTHING_SEEN, 10, config) == 1  # only the one without any confidence
-        assert tidy(surfels, NOTHING_SEEN, 11, config) == 2
+        assert tidy(surfels, 10, config) == 0  # not yet
+        assert tidy(surfels, 11, config) == 3
         np.testing.assert_array_equal(surfels.confidences, [2.0, 50.0])
 
     def test_a_speck_is_gone_after_the_time_of_grace(self) -> None:

@@ -112,11 +112,13 @@ def test_wheel_holds_the_package_and_nothing_else(wheel: Path) -> None:
     folders = {name.partition("/")[0] for name in names}
     assert "scanweld/py.typed" in names
     assert {folder.partition("-")[0] for folder in folders} == {"scanweld"}  # the package and its .dist-info
-    assert {Path(name).suffix for name in names if name.startswith("scanweld/")} == {".py", ".typed"}
+    suffixes = {Path(name).suffix for name in names if name.startswith("scanweld/")}
+    assert suffixes == {".py", ".typed", ".html", ".css", ".js"}
     assert any(name.endswith("licenses/LICENSE") for name in names)
     assert wheel.name.endswith("-py3-none-any.whl")
-    in_source = {path.relative_to(SOURCE.parents[1]).as_posix() for path in SOURCE.parent.rglob("*.py")}
-    assert {name for name in names if name.endswith(".py")} == in_source
+    for suffix in (".py", ".html", ".css", ".js"):
+        in_source = {path.relative_to(SOURCE.parents[1]).as_posix() for path in SOURCE.parent.rglob(f"*{suffix}")}
+        assert {name for name in names if name.endswith(suffix)} == in_source
 
 
 @pytest.mark.slow

@@ -194,3 +194,19 @@ print(os.waitpid(child, 0)[1])
 def test_import_of_the_package_loads_no_compiler() -> None:
     code = "import sys, scanweld; print([m for m in ('numba', 'cv2', 'scipy', 'matplotlib') if m in sys.modules])"
     assert fresh_python(code) == "[]"
+
+
+def test_a_body_that_shares_out_work_under_a_lock_does_not_wait_for_its_own_thread() -> None:
+    """As a property does that gathers its value on threads when it is first read, within a body, by several threads."""
+    lock, done = threading.Lock(), []
+    set_num_threads(2)
+
+    def gather() -> None:
+        with lock:
+            run_ranges(8, lambda start, stop: done.append((start, stop)))
+
+    finished = threading.Thread(target=lambda: run_ranges(2, lambda start, stop: gather()), daemon=True)
+    finished.start()
+    finished.join(timeout=20)
+    assert not finished.is_alive()
+    assert done == [(0, 8), (0, 8)]

@@ -7,7 +7,7 @@ import pytest
 
 import scanweld as sw
 from scanweld.geometry import se3
-from scanweld.mapping import kernels
+from scanweld.mapping.pages import CELL_M
 from scanweld.mapping.rendering import find_candidates, render_index_map, render_model_view, render_picture
 
 SMALL = sw.PinholeCamera(40.0, 42.0, 19.3, 14.8, 40, 30)
@@ -38,8 +38,14 @@ def seen_from(surfels: sw.SurfelMap, T_world_camera: np.ndarray) -> tuple[np.nda
 
 
 def index_map_of(surfels: sw.SurfelMap, T_world_camera: np.ndarray, stable: float = 0) -> tuple[np.ndarray, ...]:
+    """The index map with the places of the surfels in the map's properties, and how full its rows are."""
     candidates = find_candidates(surfels, T_world_camera, SMALL)
-    return render_index_map(surfels, candidates, T_world_camera, SMALL, stable)
+    seen = render_index_map(surfels, candidates, T_world_camera, SMALL, stable)
+    return places_of(surfels, seen.numbers), seen.row_counts
+
+
+def places_of(surfels: sw.SurfelMap, numbers: np.ndarray) -> np.ndarray:
+    return np.where(numbers >= 0, surfels.rows_of(np.maximum(numbers, 0)), -1)
 
 
 def reference_index_map(surfels: sw.SurfelMap, T_world_camera: np.ndarray, stable: float) -> np.ndarray:
@@ -58,7 +64,7 @@ def reference_index_map(surfels: sw.SurfelMap, T_world_camera: np.ndarray, stabl
 
 
 @pytest.mark.parametrize("stable", [0.0, 0.5])
-@pytest.mark.parametrize("count", [0, 1, 5000, kernels.CHUNK + 300])
+@pytest.mark.parametrize("count", [0, 1, 5000, 12_000])
 def test_index_map_matches_a_numpy_z_buffer(count: int, stable: float) -> None:
     surfels = cloud(1, count)
     index_map, row_counts = index_map_of(surfels, POSE, stable)
@@ -66,20 +72,30 @@ def test_index_map_matches_a_numpy_z_buffer(count: int, stable: float) -> None:
     np.testing.assert_array_equal(row_counts, (index_map >= 0).sum(axis=1))
 
 
-def test_candidates_are_those_near_the_image_in_order() -> None:
-    surfels = cloud(2, 3 * kernels.CHUNK // 2)
-    candidates = find_candidates(surfels, POSE, SMALL, margin_pixels=5.0, far_m=1.5)
-    listed = [candidates.ids[c * kernels.CHUNK :][:n] for c, n in enumerate(candidates.counts)]
+@pytest.mark.parametrize("seed", range(3))
+def test_candidates_hold_all_that_is_near_the_image_and_little_else(seed: int) -> None:
+    """The margin of 5 pixels is 0.12 m at 1 m; a page that reaches into the frustum reaches out of it by a cell."""
+    surfels = cloud(2 + seed, 24_000)
+    slots = find_candidates(surfels, POSE, SMALL, margin_pixels=5.0, far_m=1.5)
+    listed = np.isin(surfels.pages.live, slots)
+    in_pages = np.repeat(listed, surfels.pages.counts[surfels.pages.live])
     p, _, u, v = seen_from(surfels, POSE)
     inside = (p[2] > 0.01) & (p[2] < 1.5) & (u > -5) & (u < SMALL.width + 5) & (v > -5) & (v < SMALL.height + 5)
     assert 0.05 < inside.mean() < 0.95
-    np.testing.assert_array_equal(np.concatenate(listed), np.flatnonzero(inside))
+    assert in_pages[inside].all()
+    reach = CELL_M * np.sqrt(3)
+    margin = 5 + SMALL.fx * reach / np.maximum(p[2], 0.01)
+    near = (p[2] > -reach) & (p[2] < 1.5 + reach) & (
+        (p[2] < reach) | (np.abs(u - 20) < 22 + 2 * margin) & (np.abs(v - 15) < 17 + 2 * margin)
+    )  # fmt: skip
+    assert not in_pages[~near].any()
+    assert in_pages.mean() < 0.9
 
 
 def test_same_view_at_any_number_of_threads() -> None:
     from scanweld.parallel import get_num_threads
 
-    surfels, usual, views = cloud(3, 5 * kernels.CHUNK), get_num_threads(), set()
+    surfels, usual, views = cloud(3, 80_000), get_num_threads(), set()
     try:
         for threads in (1, 2, 3, 8):
             sw.set_num_threads(threads)
@@ -93,14 +109,45 @@ def test_same_view_at_any_number_of_threads() -> None:
 
 def test_model_view_gathers_the_surfels_of_its_pixels() -> None:
     surfels = cloud(4, 4000)
-    view = sw.SurfelMapper()
-    view.map = surfels
-    seen = view.view(POSE, SMALL)
-    ids = seen.index_map[seen.index_map >= 0]
+    mapper = sw.SurfelMapper()
+    mapper.map = surfels
+    seen = mapper.view(POSE, SMALL)
+    ids = surfels.rows_of(seen.index_map[seen.index_map >= 0])
     assert len(seen) == len(ids) > 100
+    np.testing.assert_array_equal(seen.pixels, np.flatnonzero(seen.index_map.ravel() >= 0))
     np.testing.assert_array_equal(seen.positions_m, surfels.positions_m[:, ids])
     np.testing.assert_array_equal(seen.normals, surfels.normals[:, ids])
     np.testing.assert_array_equal(seen.confidences, surfels.confidences[ids])
+    grey = np.array([0.299, 0.587, 0.114]) @ surfels.colors[:, ids]
+    np.testing.assert_allclose(seen.intensities, grey, atol=1e-3)
+    rows = np.array([5, 3, 99])
+    some = seen.take(rows)
+    np.testing.assert_array_equal(some.positions_m, seen.positions_m[:, rows])
+    np.testing.assert_array_equal(some.normals, seen.normals[:, rows])
+    np.testing.assert_array_equal(some.confidences, seen.confidences[rows])
+    np.testing.assert_array_equal(some.intensities, seen.intensities[rows])
+
+
+def test_view_outlives_changes_of_the_map() -> None:
+    surfels = cloud(4, 4000)
+    mapper = sw.SurfelMapper()
+    mapper.map = surfels
+    seen, same = mapper.view(POSE, SMALL), mapper.view(POSE, SMALL)
+    expected = same.positions_m.copy()
+    surfels.remove(np.ones(len(surfels), bool))
+    np.testing.assert_array_equal(seen.positions_m, expected)
+
+
+def test_plain_view_and_its_rows() -> None:
+    """A mapper of somebody else's may hand over arrays."""
+    points, index_map = np.arange(12, dtype=np.float32).reshape(3, 4), np.full(SMALL.shape, -1, np.int32)
+    view = sw.ModelView(POSE, SMALL, points, -points, points[0], index_map)
+    assert len(view) == 4
+    some = view.take(np.array([2, 0]))
+    np.testing.assert_array_equal(some.positions_m, points[:, [2, 0]])
+    np.testing.assert_array_equal(some.normals, -points[:, [2, 0]])
+    np.testing.assert_array_equal(some.confidences, [2, 0])
+    assert some.intensities is None
 
 
 def test_speck_does_not_hide_the_surface_it_belongs_to() -> None:
@@ -211,4 +258,6 @@ def test_view_does_not_depend_on_the_world_frame() -> None:
     moved.append(positions, normals, surfels.colors, surfels.radii_m, surfels.confidences, 0)
     a, b = index_map_of(surfels, POSE)[0], index_map_of(moved, T @ POSE)[0]
     assert (a >= 0).sum() > 300
+    # Their confidences name them: the two maps keep them in orders of their own.
+    a, b = (np.where(k >= 0, m.confidences[k], -1) for k, m in ((a, surfels), (b, moved)))
     assert (a != b).mean() < 0.005  # float32 rounding at the borders of pixels

@@ -11,7 +11,8 @@ import pytest
 import scanweld as sw
 from rendered import CAMERA, MemorySequence, blind, pose_error, rendered
 from scanweld.geometry import se3
-from scanweld.slam.motion import ConstantVelocity, trajectory_of
+from scanweld.registration.result import FreeDirection
+from scanweld.slam.motion import ConstantVelocity, Unsteadiness, trajectory_of
 from scanweld.slam.system import Slam
 
 TRACKING, LOST = sw.FrameState.TRACKING, sw.FrameState.LOST
@@ -363,6 +364,61 @@ class TestMotionModel:
         assert model.predict(0.2)[0, 3] == pytest.approx(0.02)
         assert model.predict(60.0)[0, 3] == pytest.approx(0.05)
         assert model.miss(60.0)[0, 3] == pytest.approx(0.05)
+
+    def test_jitter_and_change_are_told_apart(self) -> None:
+        """Steps whose velocity wanders by 2 mm a frame and 1 mrad, at poses that jitter by 1 mm and 1 mrad."""
+        rng, unsteadiness = np.random.default_rng(0), Unsteadiness()
+        change, jitter = np.repeat([0.002, 0.001], 3), np.full(6, 0.001)
+        velocity = np.cumsum(change * rng.standard_normal((61, 6)), axis=0)
+        poses = np.cumsum(velocity, axis=0) + jitter * rng.standard_normal((61, 6))
+        for step in np.diff(poses, axis=0):
+            unsteadiness.observe(step, 0.1)
+        np.testing.assert_allclose(unsteadiness.jitter, jitter**2, rtol=0.5)
+        np.testing.assert_allclose(unsteadiness.change(0.1), (change / 0.1) ** 2, rtol=0.5)
+
+    @staticmethod
+    def walking(jitter_m: float = 0.001) -> ConstantVelocity:
+        """15 frames, 0.1 s and 0.1 m along x apart, their steps longer and shorter in turn."""
+        model = ConstantVelocity()
+        for k in range(15):
+            model.observe(0.1 * k, se3.exp([0.1 * k + jitter_m * (k % 3), 0, 0, 0, 0, 0]))
+        return model
+
+    @staticmethod
+    def before_a_wall(T_world_camera: np.ndarray, sigma_m: float = 1e-4) -> sw.RegistrationResult:
+        """An alignment that knows the plane z = 1.5 m of the camera and nothing else."""
+        x, y = (a.ravel() for a in np.meshgrid(np.linspace(-1, 1, 9), np.linspace(-1, 1, 9)))
+        p, n = np.stack([x, y, np.full(81, 1.5)], axis=1), np.tile([0, 0, -1.0], (81, 1))
+        rows = np.concatenate([n, np.cross(p, n)], axis=1) @ se3.adjoint(se3.inverse(T_world_camera)) / sigma_m
+        free = FreeDirection("translation along (1.00, 0.00, 0.00)", np.eye(6)[0])
+        return sw.RegistrationResult(
+            T_target_source=T_world_camera, status=sw.Status.DEGENERATE, information=rows.T @ rows, unobservable=(free,)
+        )
+
+    def test_a_tilt_of_the_wall_turns_the_camera_where_it_is(self) -> None:
+        """The alignment turns the wall by 0.02 rad about its middle, 1.5 m away, which takes the camera 30 mm aside.
+        The wall's tilt is a fact, and the way aside a choice: the camera was not expected there."""
+        model = self.walking()
+        expected = model.predict(1.5)
+        pivot = se3.exp([0, 0, 1.5, 0, 0, 0])
+        aligned = expected @ pivot @ se3.exp([0, 0, 0, 0, 0.02, 0]) @ se3.inverse(pivot)
+        assert abs(aligned[0, 3] - expected[0, 3]) == pytest.approx(0.03, abs=1e-3)
+        answer = model.weigh(1.5, self.before_a_wall(aligned)).T_target_source
+        np.testing.assert_allclose(answer[:3, :3], aligned[:3, :3], atol=1e-4)
+        assert answer[2, 3] == pytest.approx(aligned[2, 3], abs=1e-3)  # 0.02 rad times 30 mm are second order
+        assert abs(answer[0, 3] - expected[0, 3]) < 3e-3
+
+    def test_what_was_guessed_for_long_is_no_speed_when_it_is_seen_again(self) -> None:
+        """Ten frames before a wall, then a pose 40 mm further than guessed: 4 to 6 mm a frame, and not 40 in one."""
+        model = self.walking()
+        for k in range(15, 25):
+            answer = model.weigh(0.1 * k, self.before_a_wall(model.predict(0.1 * k)))
+            model.observe(0.1 * k, answer.T_target_source, partly=True)
+        before = model.predict(2.5)
+        seen = before @ se3.exp([0.04, 0, 0, 0, 0, 0])
+        model.observe(2.5, seen)
+        step = (model.predict(2.6)[0, 3] - seen[0, 3]) - (before[0, 3] - answer.T_target_source[0, 3])
+        assert 0.003 < step < 0.008
 
 
 class TestTrajectoryOfResults:

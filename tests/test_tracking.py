@@ -24,6 +24,14 @@ def map_of(sequence: object, stop: int) -> sw.SurfelMapper:
     return mapper
 
 
+def of_confidence(view: sw.ModelView, confidences: np.ndarray) -> sw.ModelView:
+    """Return the same view with other confidences (N,)."""
+    return sw.ModelView(
+        view.T_world_camera, view.camera, view.positions_m, view.normals, confidences, view.index_map,
+        view.stable_confidence, view.intensities,
+    )  # fmt: skip
+
+
 def random_start(rng: np.random.Generator, shift_m: float, turn_deg: float) -> np.ndarray:
     axes = rng.standard_normal((2, 3))
     axes /= np.linalg.norm(axes, axis=1, keepdims=True)
@@ -54,8 +62,10 @@ class TestTracker:
         view, pyramid = mapper.view(guess, CAMERA), sw.build_pyramid(sequence.frames[5])
         tracker = sw.FrameToModelTracker(sw.TrackingConfig(photometry="off"))
         tracked = tracker.track(pyramid, view, guess)
-        source = tracker._select(view)
-        aligned = align_projective(*source, pyramid.levels, se3.inverse(guess), tracker.config.projective)
+        _, source = tracker._select(view)
+        aligned = align_projective(
+            source.positions_m, source.normals, pyramid.levels, se3.inverse(guess), tracker.config.projective
+        )
         T_wc, T_cw = tracked.T_target_source, aligned.T_target_source
         np.testing.assert_allclose(T_wc @ T_cw, np.eye(4), atol=1e-12)
         for eta in 1e-4 * np.eye(6):
@@ -128,8 +138,8 @@ class TestTracker:
         stable = view.confidences >= view.stable_confidence
         assert stable.mean() > 0.5  # so the others are left out
         tracker = sw.FrameToModelTracker(sw.TrackingConfig(stable_fraction=0.1))
-        positions, normals = tracker._select(view)
-        assert positions.shape == normals.shape == (3, round(0.1 * stable.sum()))
+        positions = tracker._select(view)[1].positions_m
+        assert positions.shape == (3, round(0.1 * stable.sum()))
         taken = self.taken(positions, view)
         limit = np.sort(view.confidences)[-positions.shape[1]]
         assert taken[view.confidences > limit].all()
@@ -143,7 +153,7 @@ class TestTracker:
         view = mapper.view(rendered(count=40).ground_truth.T_world_camera[0], CAMERA)
         for share, expected in ((0.3, 1.0), (0.7, 0.7)):
             confidences = np.where(np.random.default_rng(1).random(len(view)) < share, 9, 1).astype(np.float32)
-            positions, _ = sw.FrameToModelTracker()._select(replace(view, confidences=confidences))
+            positions = sw.FrameToModelTracker()._select(of_confidence(view, confidences))[1].positions_m
             assert positions.shape[1] / len(view) == pytest.approx(expected, abs=0.02)
 
     @pytest.mark.parametrize("confidence", [1.0, 100.0])
@@ -151,8 +161,9 @@ class TestTracker:
         """Confidence stops growing at a limit, so ties are the rule in a long run; they must not favour a corner."""
         mapper = map_of(rendered(count=40), 1)
         view = mapper.view(rendered(count=40).ground_truth.T_world_camera[0], CAMERA)
-        view = replace(view, confidences=np.full(len(view), confidence, np.float32))
-        positions, _ = sw.FrameToModelTracker(sw.TrackingConfig(stable_fraction=0.1))._select(view)
+        view = of_confidence(view, np.full(len(view), confidence, np.float32))
+        tracker = sw.FrameToModelTracker(sw.TrackingConfig(stable_fraction=0.1))
+        positions = tracker._select(view)[1].positions_m
         places = np.flatnonzero(self.taken(positions, view)) / len(view)
         assert len(places) == positions.shape[1] == round(0.1 * len(view))
         np.testing.assert_allclose(np.percentile(places, [5, 25, 50, 75, 95]), [0.05, 0.25, 0.5, 0.75, 0.95], atol=0.02)
@@ -161,7 +172,7 @@ class TestTracker:
         mapper = map_of(rendered(count=40), 1)
         view = mapper.view(rendered(count=40).ground_truth.T_world_camera[0], CAMERA)
         config = sw.TrackingConfig(stable_fraction=0.001)
-        positions, _ = sw.FrameToModelTracker(config)._select(view)
+        positions = sw.FrameToModelTracker(config)._select(view)[1].positions_m
         assert positions.shape[1] == config.projective.min_points
 
     @staticmethod

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from scanweld.config import from_mapping, to_toml
     from scanweld.datasets.base import RgbdSequence
+    from scanweld.datasets.gyroscope import Gyroscope
     from scanweld.datasets.open import open_sequence
     from scanweld.datasets.stream import stream
     from scanweld.datasets.synthetic import RenderConfig, SyntheticSequence, render_sequence
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
         ScanweldError,
         UnreadableFrameError,
     )
+    from scanweld.evaluation.doubled_surfaces import doubled_surfaces
     from scanweld.evaluation.surface_metrics import (
         compression_ratio,
         depth_completeness,
@@ -46,9 +48,13 @@ if TYPE_CHECKING:
     from scanweld.loop_closure.loop_closer import KeyframeLoopCloser, LoopClosingConfig, NoLoopCloser
     from scanweld.mapping.fusion import FusionConfig
     from scanweld.mapping.mapper import SurfelMapper
+    from scanweld.mapping.merging import MergingConfig
     from scanweld.mapping.rendering import render_picture
     from scanweld.mapping.surfel_map import SurfelMap
     from scanweld.parallel import set_num_threads
+    from scanweld.refinement.calibration import DepthCorrection
+    from scanweld.refinement.config import RefinementConfig
+    from scanweld.refinement.refine import Refinement, RefinementStatus, refine_keyframes
     from scanweld.registration.closed_form import (
         ClosedFormBatch,
         align_closed_form,
@@ -67,6 +73,7 @@ if TYPE_CHECKING:
     from scanweld.registration.uncertainty import point_covariances
     from scanweld.runs.run import RunSummary, run_sequence
     from scanweld.slam.health import HealthConfig
+    from scanweld.slam.submaps import SubmapConfig
     from scanweld.slam.system import Slam, SlamConfig, build_slam
     from scanweld.tracking.dynamics import DynamicsConfig
     from scanweld.tracking.rotation import RotationPrior
@@ -125,6 +132,13 @@ _HOME = {
     "tracking.rotation": ("RotationPrior",),
     "tracking.tracker": ("FrameToModelTracker", "TrackingConfig"),
     "tracking.two_frames": ("TwoFrameConfig", "align_frames"),
+    "datasets.gyroscope": ("Gyroscope",),
+    "evaluation.doubled_surfaces": ("doubled_surfaces",),
+    "mapping.merging": ("MergingConfig",),
+    "refinement.calibration": ("DepthCorrection",),
+    "refinement.config": ("RefinementConfig",),
+    "refinement.refine": ("Refinement", "RefinementStatus", "refine_keyframes"),
+    "slam.submaps": ("SubmapConfig",),
     "trajectory": ("FrameResult", "FrameState", "Trajectory"),
 }  # fmt: skip
 _MODULE_OF = {name: module for module, names in _HOME.items() for name in names}
@@ -133,6 +147,7 @@ __all__ = [
     "ClosedFormBatch",
     "ConfigError",
     "DatasetError",
+    "DepthCorrection",
     "DynamicsConfig",
     "FileFormatError",
     "Frame",
@@ -141,6 +156,7 @@ __all__ = [
     "FrameToModelTracker",
     "FusionConfig",
     "GlobalConfig",
+    "Gyroscope",
     "HealthConfig",
     "IcpConfig",
     "InvalidInputError",
@@ -149,6 +165,7 @@ __all__ = [
     "ManyConfig",
     "ManyResult",
     "MapCorrection",
+    "MergingConfig",
     "MissingDependencyError",
     "ModelView",
     "MotionPrior",
@@ -160,6 +177,9 @@ __all__ = [
     "PoseGraphConfig",
     "PoseGraphResult",
     "ProjectiveConfig",
+    "Refinement",
+    "RefinementConfig",
+    "RefinementStatus",
     "RegistrationResult",
     "RenderConfig",
     "RgbdSequence",
@@ -171,6 +191,7 @@ __all__ = [
     "Slam",
     "SlamConfig",
     "Status",
+    "SubmapConfig",
     "SurfaceConfig",
     "SurfacePyramid",
     "SurfelMap",
@@ -190,6 +211,7 @@ __all__ = [
     "build_slam",
     "compression_ratio",
     "depth_completeness",
+    "doubled_surfaces",
     "edge_information",
     "estimate_normals",
     "explain_horn",
@@ -202,6 +224,7 @@ __all__ = [
     "read_ply",
     "read_points",
     "read_trajectory",
+    "refine_keyframes",
     "register_global",
     "register_many",
     "render_picture",
@@ -222,6 +245,10 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version("scanweld")
     module = _MODULE_OF.get(name)
     if module is None:
         raise AttributeError(f"module 'scanweld' has no attribute {name!r}")

@@ -146,8 +146,10 @@ def run_ranges(count: int, body: Callable[[int, int], object], *, grain: int = 1
         )
     futures: list[Future[object]] = [_pool.submit(body, start, stop) for start, stop in ranges[1:]]
     try:
+        _inside.pool = True  # the workers are busy: what the body itself would share out, it does alone
         body(*ranges[0])
     finally:
+        _inside.pool = False
         wait(futures)  # nobody writes into the caller's arrays once it goes on
     for future in futures:
         future.result()

@@ -89,7 +89,7 @@ class FrameResult:
     timestamp_s : [s]
     state : see :class:`FrameState`
     status : the aligner's status in lower case, "" where no alignment ran
-    T_world_camera : (4, 4)
+    T_world_camera : (4, 4), in the world of its submap
     rmse_m : root mean square point-to-plane distance of the inliers [m]
     loss : mean robust loss of the matched points at the last iteration, in units of the noise (dimensionless)
     num_inliers : matched points with a residual below the robust threshold
@@ -97,6 +97,7 @@ class FrameResult:
     num_surfels : size of the map after the frame
     stage_ms : wall time by stage [ms]
     note : one line for a person when the state is not TRACKING or the status not "converged", else ""
+    submap : the map that the frame is in; what was never joined with the main one is in a world of its own
     """
 
     index: int
@@ -111,3 +112,4 @@ class FrameResult:
     num_surfels: int = 0
     stage_ms: Mapping[str, float] = field(default_factory=dict)
     note: str = ""
+    submap: int = 0

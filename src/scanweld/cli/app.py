@@ -15,11 +15,15 @@ from typing import Annotated, Any
 
 import typer
 
+from scanweld.cli.bench import bench
 from scanweld.cli.demo import demo
 from scanweld.cli.evaluate import evaluate
+from scanweld.cli.mesh import mesh
 from scanweld.cli.register import register
 from scanweld.cli.render import render
+from scanweld.cli.report import report
 from scanweld.cli.slam import slam
+from scanweld.cli.warmup import warmup
 from scanweld.errors import ScanweldError
 
 PANEL_COLUMNS = 80
@@ -49,7 +53,7 @@ def _stoppable(command: Callable[..., int]) -> Callable[..., int]:
     return call
 
 
-for command in (demo, slam, register, evaluate, render):
+for command in (demo, slam, register, evaluate, render, report, mesh, bench, warmup):
     app.command()(_stoppable(command))
 
 

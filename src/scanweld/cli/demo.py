@@ -44,5 +44,5 @@ def demo(
         )  # fmt: skip
     code = print_summary(summary, json_output=json_output)
     if not json_output:
-        typer.echo(f"look at {out}/renders/overview-rgb.png and {out}/plots/trajectory.png")
+        typer.echo(f"look at {out}/report.html in a browser, and at {out}/renders/overview-rgb.png")
     return code

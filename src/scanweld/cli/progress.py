@@ -71,14 +71,20 @@ class FrameProgress:
 
 
 class RenderProgress:
-    """Shows how many frames are rendered."""
+    """Shows how many frames are rendered, or what else `title` says is done with them."""
+
+    def __init__(self, title: str = "render") -> None:
+        self.title = title
 
     def __enter__(self) -> RenderProgress:
         console = Console(stderr=True)
-        columns = (TextColumn("[bold]render"), BarColumn(bar_width=None), MofNCompleteColumn(), TimeRemainingColumn())
+        columns = (
+            TextColumn("[bold]{task.description}"), BarColumn(bar_width=None), MofNCompleteColumn(),
+            TimeRemainingColumn(),
+        )  # fmt: skip
         self._live = console.is_terminal
         self._bar = Progress(*columns, console=console, transient=True, disable=not self._live)
-        self._task = self._bar.add_task("render", total=None)
+        self._task = self._bar.add_task(self.title, total=None)
         self._bar.start()
         self._spoken = time.perf_counter()
         return self
@@ -93,4 +99,4 @@ class RenderProgress:
             self._bar.update(self._task, completed=done, total=total)
         elif now - self._spoken > QUIET_INTERVAL_S:
             self._spoken = now
-            print(f"render: frame {done}/{total}", file=sys.stderr, flush=True)
+            print(f"{self.title}: frame {done}/{total}", file=sys.stderr, flush=True)

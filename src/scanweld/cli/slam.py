@@ -7,7 +7,7 @@ import json
 import logging
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -23,9 +23,24 @@ Option = typer.Option
 
 
 def slam(
-    sequence: Annotated[Path, typer.Argument(help="Sequence folder: TUM, Redwood, 7-Scenes, ICL-NUIM.")],
+    sequence: Annotated[
+        Path,
+        typer.Argument(
+            help="Sequence: a folder or a recording (TUM, ScanNet, Record3D, a ROS bag, ...: see docs/formats.md)."
+        ),
+    ],
     out: Annotated[Path | None, Option(help="Run folder. Default: runs/SEQUENCE-N.", metavar="RUN")] = None,
-    format_name: Annotated[str, Option("--format", help="auto, tum, redwood, 7scenes or icl.")] = "auto",
+    format_name: Annotated[
+        str,
+        Option(
+            "--format",
+            help="auto, 7scenes, bonn, bundlefusion, eth3d, icl, record3d, redwood, replica, rosbag, scannet, stray, "
+            "tum, video.",
+        ),
+    ] = "auto",
+    topics: Annotated[
+        str | None, Option(help="Topics of a bag, where it has several.", metavar="depth=/A,color=/B")
+    ] = None,
     camera: Annotated[str | None, Option(help="Intrinsics of the images on disk.", metavar="FX,FY,CX,CY")] = None,
     depth_scale: Annotated[float | None, Option(help="Depth units per metre, for example 5000.")] = None,
     frames: Annotated[str | None, Option(help="Use a part of the frames.", metavar="A:B[:STEP]")] = None,
@@ -39,6 +54,10 @@ def slam(
     tracked_only: Annotated[
         bool, Option("--tracked-only", help="Leave frames without a measured pose out of trajectory.txt.")
     ] = False,
+    calibrate: Annotated[
+        bool, Option("--calibrate", help="Estimate intrinsics and depth offset, then run again with them.")
+    ] = False,
+    refine: Annotated[bool, Option("--refine", help="Adjust all keyframes together in the end.")] = False,
     force: Annotated[bool, Option("--force", help="Replace an existing run.")] = False,
     json_output: Annotated[bool, Option("--json", help="Print the metrics as one JSON object.")] = False,
 ) -> int:
@@ -59,19 +78,20 @@ def slam(
             depth_scale=depth_scale,
             frames=frames,
             scale=scale,
+            topics=topics,
         )
     from scanweld.runs.folder import next_run_folder
 
-    folder = out or next_run_folder(sequence.resolve().name)
+    folder = out or next_run_folder(opened.name)
     given = None if poses is None else given_poses(opened, poses)
     description = {
         "input": str(sequence.resolve()), "format": format_name, "frames": frames, "scale": scale, "poses": poses,
-        "camera": camera, "depth_scale": depth_scale, "config": str(config) if config else None,
-        "set": overrides or [], "warnings": warnings,
+        "camera": camera, "depth_scale": depth_scale, "topics": topics, "config": str(config) if config else None,
+        "set": overrides or [], "calibrate": calibrate, "refine": refine, "warnings": warnings,
     }  # fmt: skip
     summary = run_with_progress(
         opened, settings, folder, force=force, poses=given, threads=threads, tracked_only=tracked_only,
-        description=description, started=started,
+        calibrate=calibrate, refine=refine, description=description, started=started,
     )  # fmt: skip
     return print_summary(summary, json_output=json_output)
 
@@ -135,7 +155,8 @@ def run_with_progress(
     if threads is not None:
         set_num_threads(threads)
     check_writable(folder, force=options.get("force", False))
-    with FrameProgress(len(sequence), title) as progress:
+    passes = 2 if options.get("calibrate") else 1
+    with FrameProgress(passes * len(sequence), title) as progress:
         compile_kernels(lambda part: progress.say(f"compiling, once for this machine: {part}"))
         return run_sequence(sequence, config, out=folder, progress=progress.update, started=started, **options)
 
@@ -159,6 +180,13 @@ def print_summary(summary: RunSummary, *, json_output: bool) -> int:
     return 0
 
 
+def apart_text(metrics: Mapping[str, Any]) -> str:
+    """Say what became of submaps that were not joined with the main map."""
+    count, frames = metrics["submaps_unjoined"], metrics["frames_in_unjoined_submaps"]
+    what = "1 submap" if count == 1 else f"{count} submaps"
+    return f"{what} with {frames} frames, counted as lost: no place in common with the map was found"
+
+
 def summary_text(summary: RunSummary) -> str:
     """Return the summary of a run as lines for a person."""
     m = summary.metrics
@@ -169,6 +197,9 @@ def summary_text(summary: RunSummary) -> str:
         ("map", f"{m['num_surfels']:,} surfels from {m['num_points_input']:,} points"),
         ("path", f"{m['path_length_m']:.2f} m"),
     ]
+    if m["submaps_unjoined"]:
+        rows.append(("apart", apart_text(m)))
+    rows += [("refined", found.note) for found in summary.refinements]
     if m["ate_rmse_m"] is not None:
         rows.append(("ATE", f"{m['ate_rmse_m'] * 1e3:.2f} mm rmse, {m['ate_max_m'] * 1e3:.2f} mm at most"))
     if m["rpe_trans_m"] is not None:

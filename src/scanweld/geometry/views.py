@@ -19,6 +19,13 @@ class ModelRows:
     confidences: Float32
     intensities: Float32 | None = None
 
+    def take(self, rows: Int64) -> ModelRows:
+        """Return some of the rows (M,), in the given order."""
+        return ModelRows(
+            np.take(self.positions_m, rows, axis=1), np.take(self.normals, rows, axis=1), self.confidences[rows],
+            None if self.intensities is None else self.intensities[rows],
+        )  # fmt: skip
+
 
 class ModelView:
     """The surfels that a camera sees, one at most per pixel, as rows of equal length N.
@@ -66,10 +73,7 @@ class ModelView:
 
     def take(self, rows: Int64) -> ModelRows:
         """Return some of the rows (M,), in the given order."""
-        return ModelRows(
-            np.take(self.positions_m, rows, axis=1), np.take(self.normals, rows, axis=1), self.confidences[rows],
-            None if self.intensities is None else self.intensities[rows],
-        )  # fmt: skip
+        return ModelRows(self.positions_m, self.normals, self.confidences, self.intensities).take(rows)
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,8 +1,8 @@
-"""Whether keyframes fit each other: where they are thought to be, and better after a loop was closed than before."""
+"""Whether keyframes fit each other: in place, better after a loop was closed than before, across two submaps."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 
 import numpy as np
 
@@ -11,12 +11,23 @@ from scanweld.geometry import se3
 from scanweld.geometry.depth import SurfaceConfig, SurfacePyramid
 from scanweld.loop_closure.keyframes import Keyframe
 from scanweld.registration.verification import Agreement, check_against_depth
+from scanweld.tracking.appearance import compare_appearance
 
 _NEIGHBOURS = 4  # keyframes to either side of the two of a loop that are asked
 _PAIRS = 8  # of keyframes that are compared, at most
 _COMPARED = 800  # points that must meet the other view for the comparison to count
 _IN_PLACE, _IN_PLACE_CONFLICT = 0.6, 0.03  # agreement and conflict of a keyframe that is where it should be
 _LEAST_AGREEMENT, _MOST_CONFLICT = 0.5, 0.12  # on average, of keyframes after a loop was closed
+
+# Joining two maps cannot be undone, and there is no drift of a long way between them that would blur what they share:
+# on rendered rooms true joins agree in 0.98 and more, with a correlation of 0.88 and more in every pair of keyframes.
+# The two ends of a corridor that differ in their pictures alone agree in 0.85, with a correlation of 0.35 in the worst.
+_ACROSS = 12  # keyframes of a submap that are compared with those of another, at most
+_FEWEST_ACROSS = 2  # of which so many must see common ground
+_AGREE_ACROSS, _CONFLICT_ACROSS = 0.7, 0.05  # on average
+_WORST_CONFLICT = 0.12  # of any of them: one that stands in free space is enough to speak against a join
+_LEAST_CORRELATION, _WORST_CORRELATION = 0.7, 0.5  # of the textures on common ground: in the median, and of any
+_SIDEWAYS_M = 1.0  # a view this far aside is as bad as one that is turned by a radian
 
 
 def fits_in_place(
@@ -56,6 +67,72 @@ def fits_better(
         return False
     agree, conflict = np.mean(after, axis=0)
     return bool(np.mean(gains) > 0 and agree >= _LEAST_AGREEMENT and conflict <= _MOST_CONFLICT)
+
+
+def fits_together(
+    kept: Sequence[Keyframe],
+    joined: Sequence[Keyframe],
+    T_kept_joined: Float64,
+    involved: Collection[int],
+    surfaces: SurfaceConfig,
+) -> str:
+    """Say why the keyframes of two submaps do not fit each other when these are joined so; "" when they do.
+
+    Parameters
+    ----------
+    kept, joined : the keyframes of both, in the worlds of their submaps
+    T_kept_joined : (4, 4), from the world of the second to that of the first
+    involved : indices of the keyframes that proposed it; they are not asked
+    """
+    seen: list[tuple[Agreement, float | None]] = []
+    for a, b in _views_alike(kept, joined, T_kept_joined, involved):
+        target, source = a.pyramid(surfaces), b.pyramid(surfaces)
+        T_a_b = se3.inverse(a.T_world_camera) @ T_kept_joined @ b.T_world_camera
+        agreement = _agreement(source, target, T_a_b)
+        if agreement.compared < _COMPARED:
+            continue
+        appearance = compare_appearance(source, target, T_a_b)
+        seen.append((agreement, appearance.correlation if appearance.telling else None))
+    if len(seen) < _FEWEST_ACROSS:
+        return f"only {len(seen)} other keyframes see common ground"
+    agree, conflict = np.mean([(a.agree, a.conflict) for a, _ in seen], axis=0)
+    worst = max(a.conflict for a, _ in seen)
+    if agree < _AGREE_ACROSS or conflict > _CONFLICT_ACROSS or worst > _WORST_CONFLICT:
+        return (
+            f"{agree:.0%} of what other keyframes saw agrees, {conflict:.0%} would stand in free space, "
+            f"in the worst of them {worst:.0%}"
+        )
+    textures = [correlation for _, correlation in seen if correlation is not None]
+    if textures and (np.median(textures) < _LEAST_CORRELATION or min(textures) < _WORST_CORRELATION):
+        return (
+            f"other keyframes do not look alike: the correlation of their texture is {np.median(textures):.2f}, "
+            f"in the worst of them {min(textures):.2f}"
+        )
+    return ""
+
+
+def _views_alike(
+    kept: Sequence[Keyframe], joined: Sequence[Keyframe], T_kept_joined: Float64, involved: Collection[int]
+) -> Iterator[tuple[Keyframe, Keyframe]]:
+    """Yield keyframes of one submap, evenly over it, each with the one of the other that looked from nearest by."""
+    others = [keyframe for keyframe in kept if keyframe.index not in involved]
+    askers = [keyframe for keyframe in joined if keyframe.index not in involved]
+    if not others or not askers:
+        return
+    T_camera_world = se3.inverse(np.stack([keyframe.T_world_camera for keyframe in others]))
+    pairs = []
+    for asker in askers:
+        motion = T_camera_world @ T_kept_joined @ asker.T_world_camera
+        apart = np.linalg.norm(motion[:, :3, 3], axis=1) / _SIDEWAYS_M + se3.rotation_angle_rad(motion)
+        pairs.append((float(apart.min()), others[int(apart.argmin())], asker))
+    # Those far from everything see no common ground; of the others, an even share.
+    near = [(a, b) for apart, a, b in pairs if apart < _APART]
+    for k in np.unique(np.linspace(0, len(near) - 1, min(_ACROSS, len(near))).astype(int)) if near else ():
+        yield near[k]
+
+
+_APART = 1.2
+"""Views that are further apart, in metres and radians together, hardly see common ground."""
 
 
 def _pairs(count: int, i: int, j: int) -> Iterator[tuple[int, int]]:

@@ -4,6 +4,8 @@
 look alike but do not fit where the map thinks they are. A place that is verified becomes an edge that may be wrong; the
 graph is solved, edges that the odometry cannot explain are dropped, and the answer is kept only when keyframes that
 took no part fit each other better than before: a closure that looks right but bends the rest is worse than none.
+Keyframes of all submaps are in one database, each with the number of its own: a new one is also compared with those of
+other submaps, which may join them (:mod:`~.joining`).
 """
 
 from __future__ import annotations
@@ -13,12 +15,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from scanweld.arrays import Array, Float64
+from scanweld.arrays import Bool, Float64, Int64
 from scanweld.config import check_ranges, section, setting
 from scanweld.geometry import se3
 from scanweld.geometry.depth import SurfacePyramid
 from scanweld.geometry.views import MapCorrection
 from scanweld.loop_closure.held_out import fits_better, fits_in_place
+from scanweld.loop_closure.joining import Join, JoinFinder, PlacePair
 from scanweld.loop_closure.keyframes import Keyframe, Sighting
 from scanweld.loop_closure.place_recognition import KeyframeDatabase, PlaceConfig
 from scanweld.loop_closure.place_verification import VerificationConfig, relocalise, verify_place
@@ -89,49 +92,114 @@ class _Edge:
 
 
 class KeyframeLoopCloser:
-    """Keyframes, places and a pose graph over them."""
+    """Keyframes, places and a pose graph over them.
+
+    Attributes
+    ----------
+    database : all keyframes, each in the world of its submap
+    submap : the one that the camera is in
+    num_closures : loops closed so far
+    """
 
     def __init__(self, config: LoopClosingConfig | None = None) -> None:
         self.config = config or LoopClosingConfig()
         self.database = KeyframeDatabase(self.config.places)
         self.num_closures = 0
+        self.submap = 0
+        self._submaps: list[int] = []  # of each keyframe
+        self._num_submaps = 1  # that there ever were
+        self._joins = JoinFinder(self.config.drift, self.config.places.keyframes.surfaces)
         self._edges: list[_Edge] = []
         self._seen_since = True  # whether the camera was tracked all the way from the last keyframe
 
     @property
     def keyframe(self) -> int:
         """The keyframe that new surfels and frames belong to."""
-        return max(len(self.database) - 1, 0)
+        return int(max(self._members(), default=0))
 
-    def process(self, pyramid: SurfacePyramid, result: FrameResult) -> MapCorrection | None:
-        """Look at a tracked frame; return a correction when a loop was closed."""
-        if not self.database.reason(pyramid, result.T_world_camera):
+    @property
+    def loops(self) -> list[tuple[int, int]]:
+        """Pairs of keyframes that loops tie together."""
+        return [(edge.i, edge.j) for edge in self._edges if edge.loop]
+
+    def process(self, pyramid: SurfacePyramid, result: FrameResult) -> MapCorrection | Join | None:
+        """Look at a tracked frame; return a correction when a loop was closed, or what joins two submaps."""
+        if not self.database.reason(pyramid, result.T_world_camera, among=self._in_submap()):
             return None
         sighting = self.database.sight(pyramid)
         if sighting.usable < self.database.config.keyframes.min_usable:
             return None
-        keyframe = self.database.add(sighting, result.T_world_camera, frame_index=result.index)
-        if keyframe.index > 0:
-            self._edges.append(self._odometry(keyframe))
-        self._seen_since = True
+        keyframe = self._add(sighting, result.T_world_camera, result.index)
         for candidate in self._revisited(sighting, keyframe):
             loop = self._verified(sighting, keyframe, candidate)
             if loop is not None:
                 correction = self._close(loop)
                 if correction is not None:
                     return correction
-        return None
+        return self._joining(sighting, keyframe)
 
     def relocalise(self, pyramid: SurfacePyramid) -> RegistrationResult:
         """Look for a lost camera; only CONVERGED says that T_target_source is T_world_camera."""
+        return self.look_for(pyramid)[1]
+
+    def look_for(self, pyramid: SurfacePyramid) -> tuple[int, RegistrationResult]:
+        """Look for a lost camera in all submaps; return the submap and what :meth:`relocalise` does, in its world."""
         self._seen_since = False
         found = relocalise(self.database.sight(pyramid), self.database, self.config.verification)
-        pose = np.eye(4) if found.T_world_camera is None else found.T_world_camera
-        return replace(found.result, T_target_source=pose)
+        if found.T_world_camera is None:
+            return self.submap, replace(found.result, T_target_source=np.eye(4))
+        return self._submaps[found.keyframe], replace(found.result, T_target_source=found.T_world_camera)
 
-    def _odometry(self, keyframe: Keyframe) -> _Edge:
+    def begin_submap(self, pyramid: SurfacePyramid, T_world_camera: Float64, frame_index: int) -> int | None:
+        """Begin a submap with a frame, its first keyframe; return its number, or None where the frame can be none.
+
+        `T_world_camera` is in the world of the new submap, which the camera is in from now on.
+        """
+        sighting = self.database.sight(pyramid)
+        if len(self.database) == 0 or sighting.usable < self.database.config.keyframes.min_usable:
+            return None
+        self.submap, self._num_submaps = self._num_submaps, self._num_submaps + 1
+        self._add(sighting, T_world_camera, frame_index)
+        return self.submap
+
+    def enter(self, submap: int) -> None:
+        """Go on in a submap, in which the camera was found."""
+        self.submap = submap
+
+    def join(self, join: Join) -> MapCorrection:
+        """Make one submap of two; return how the keyframes of the joined one move."""
+        moved = self._members(join.joined)
+        poses = [keyframe.T_world_camera for keyframe in self.database.keyframes]
+        for index in moved:
+            poses[index] = join.T_kept_joined @ poses[index]
+            self._submaps[index] = join.kept
+        self.database.move(poses)
+        # The first edge holds the two parts of the graph together, so it may not be dropped; the second may.
+        self._edges += [
+            _Edge(p.i, p.j, p.T_i_j, p.information, loop) for p, loop in zip(join.pairs, (False, True), strict=True)
+        ]
+        self.submap = join.kept if self.submap == join.joined else self.submap
+        return MapCorrection(moved.astype(np.int32), np.tile(join.T_kept_joined, (len(moved), 1, 1)))
+
+    def _in_submap(self, submap: int | None = None) -> Bool:
+        """Return which keyframes (K,) are those of a submap, by default of the one that the camera is in."""
+        return np.asarray(np.array(self._submaps, np.int64) == (self.submap if submap is None else submap))
+
+    def _members(self, submap: int | None = None) -> Int64:
+        return np.flatnonzero(self._in_submap(submap))
+
+    def _add(self, sighting: Sighting, T_world_camera: Float64, frame_index: int) -> Keyframe:
+        """Remember a frame in the submap at hand, with the motion from the keyframe before."""
+        before = self._members()
+        keyframe = self.database.add(sighting, T_world_camera, frame_index=frame_index)
+        self._submaps.append(self.submap)
+        if len(before):
+            self._edges.append(self._odometry(self.database[before[-1]], keyframe))
+        self._seen_since = True
+        return keyframe
+
+    def _odometry(self, before: Keyframe, keyframe: Keyframe) -> _Edge:
         """Return the edge from the keyframe before; how well the motion is known grows with its length."""
-        before = self.database[keyframe.index - 1]
         T_i_j = se3.inverse(before.T_world_camera) @ keyframe.T_world_camera
         length, turn = float(np.linalg.norm(T_i_j[:3, 3])), float(se3.rotation_angle_rad(T_i_j))
         drift = self.config.drift
@@ -144,8 +212,8 @@ class KeyframeLoopCloser:
 
     def _revisited(self, sighting: Sighting, keyframe: Keyframe) -> list[int]:
         """Return older keyframes that look alike, where the map does not already agree."""
-        allowed: Array = np.zeros(len(self.database), np.bool_)
-        allowed[: max(0, len(self.database) - 1 - self.config.min_gap)] = True
+        allowed = np.zeros(len(self.database), np.bool_)
+        allowed[self._members()[: -1 - self.config.min_gap]] = True
         if not allowed.any():
             return []
         found = self.database.query(sighting, self.config.candidates, allowed=allowed)
@@ -167,28 +235,49 @@ class KeyframeLoopCloser:
             return None
         return _Edge(candidate, keyframe.index, result.T_target_source, edge_information(result), True)
 
+    def _joining(self, sighting: Sighting, keyframe: Keyframe) -> Join | None:
+        """Compare a new keyframe with those of other submaps; return what joins two of them."""
+        elsewhere = ~self._in_submap()
+        if not elsewhere.any():
+            return None
+        for candidate in self.database.query(sighting, self.config.candidates, allowed=elsewhere):
+            edge = self._verified(sighting, keyframe, candidate.index)
+            if edge is not None:
+                pair = PlacePair(edge.i, edge.j, edge.T_i_j, edge.information)
+                join = self._joins.add(pair, self.database.keyframes, self._submaps)
+                if join is not None:
+                    return join
+        return None
+
     def _close(self, loop: _Edge) -> MapCorrection | None:
         """Solve the graph with one more edge; keep the answer when keyframes that took no part fit better."""
-        old = np.stack([keyframe.T_world_camera for keyframe in self.database.keyframes])
+        members = self._members()
+        node = {int(index): k for k, index in enumerate(members)}
+        keyframes = [self.database[index] for index in members]
+        old = np.stack([keyframe.T_world_camera for keyframe in keyframes])
         graph = PoseGraph()
         for pose in old:
             graph.add_node(pose)
         edges = [*self._edges, loop]
         for edge in edges:
-            graph.add_edge(edge.i, edge.j, edge.T_i_j, edge.information, robust=edge.loop)
+            if edge.i in node:
+                graph.add_edge(node[edge.i], node[edge.j], edge.T_i_j, edge.information, robust=edge.loop)
         solved = graph.optimise()
         if not solved.status.has_pose or solved.weights[-1] < _KEPT_WEIGHT:
             logger.info("loop %d -> %d: the rest of the path does not allow it", loop.i, loop.j)
             return None
         new = solved.T_world_node
-        if not fits_better(self.database.keyframes, old, new, loop.i, loop.j, self.config.places.keyframes.surfaces):
+        if not fits_better(keyframes, old, new, node[loop.i], node[loop.j], self.config.places.keyframes.surfaces):
             logger.info("loop %d -> %d: other keyframes do not fit better", loop.i, loop.j)
             return None
         self._edges = edges
-        self.database.move(new)
+        poses = [keyframe.T_world_camera for keyframe in self.database.keyframes]
+        for index, pose in zip(members, new, strict=True):
+            poses[index] = pose
+        self.database.move(poses)
         self.num_closures += 1
         T_new_old = new @ se3.inverse(old)
-        return MapCorrection(np.arange(len(old), dtype=np.int32), T_new_old)
+        return MapCorrection(members.astype(np.int32), T_new_old)
 
 
 _KEPT_WEIGHT = 0.5

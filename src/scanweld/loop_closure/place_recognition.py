@@ -95,10 +95,14 @@ class KeyframeDatabase:
         """Return what has to be known of a frame to add it or to look for its place."""
         return sighting_of(pyramid, self.ferns, self.config.keyframes)
 
-    def reason(self, pyramid: SurfacePyramid, T_world_camera: Float64) -> str:
-        """Say why a tracked frame should be added; "" when it should not (:func:`~.keyframes.keyframe_reason`)."""
-        similarity = float(self.similarities(self.ferns.encode(pyramid)).max(initial=0.0))
-        last = self._keyframes[-1] if self._keyframes else None
+    def reason(self, pyramid: SurfacePyramid, T_world_camera: Float64, *, among: Array | None = None) -> str:
+        """Say why a tracked frame should be added; "" when it should not (:func:`~.keyframes.keyframe_reason`).
+
+        `among` : (K,) bool, the keyframes of its own world, which it is compared with; all by default.
+        """
+        mine = np.ones(len(self), np.bool_) if among is None else np.asarray(among, np.bool_)
+        similarity = float(self.similarities(self.ferns.encode(pyramid))[mine].max(initial=0.0))
+        last = self._keyframes[int(np.flatnonzero(mine)[-1])] if mine.any() else None
         return keyframe_reason(pyramid, T_world_camera, last, similarity, self.config.keyframes)
 
     def add(self, sighting: Sighting, T_world_camera: Float64, *, frame_index: int) -> Keyframe:

@@ -7,13 +7,13 @@ from functools import lru_cache
 
 import numpy as np
 
-from scanweld.arrays import Bool, Float32, Float64, Int32, Int64, UInt8
+from scanweld.arrays import Bool, Float32, Float64, Int32
 from scanweld.config import check_ranges, section, setting
 from scanweld.geometry.camera import PinholeCamera
 from scanweld.geometry.depth import SurfacePyramid, as_kernel_input, intrinsics_array
 from scanweld.mapping import kernels
 from scanweld.mapping.merging import MergingConfig
-from scanweld.mapping.rendering import Candidates, render_index_map
+from scanweld.mapping.rendering import DepthBuffers, SurfelView, render_model_view
 from scanweld.mapping.surfel_map import SurfelMap
 from scanweld.parallel import run_ranges
 
@@ -74,19 +74,25 @@ def radial_weight(camera: PinholeCamera) -> Float32:
     return weight
 
 
+NOTHING_MOVES = np.zeros((0, 0), np.bool_)
+"""A mask of no image."""
+
+
 def fuse(
     surfels: SurfelMap,
-    candidates: Candidates,
+    candidates: Int32,
     pyramid: SurfacePyramid,
     T_world_camera: Float64,
     frame_id: int,
     config: FusionConfig,
-    index_map: Int32 | None = None,
+    view: SurfelView | None = None,
     moving: Bool | None = None,
+    depth_buffers: DepthBuffers | None = None,
 ) -> FusionCounts:
-    """Merge a frame into the map, in place; `index_map` (H, W) is that of the pose where it is known already.
+    """Merge a frame into the map, in place; `view` is the map seen from this pose, where it is known already.
 
-    Pixels in `moving` (H, W) add nothing to the map, and surfels that they lie on are demoted.
+    Pixels in `moving` (H, W) add nothing to the map, and surfels that they lie on are demoted to the confidence of one
+    measurement (Keller et al. 2013, sec. 6).
     """
     level = pyramid.levels[0]
     camera, surface = level.camera, level.surface
@@ -94,92 +100,58 @@ def fuse(
     if color is None:
         color = np.full((*camera.shape, 3), 160, np.uint8)
     color = as_kernel_input(color, np.uint8)
-    alpha, most = radial_weight(camera), np.float32(config.max_confidence)
+    alpha, moving = radial_weight(camera), NOTHING_MOVES if moving is None else as_kernel_input(moving, np.bool_)
+    weights = alpha if moving is NOTHING_MOVES else np.where(moving, -alpha, alpha)
+    weights.flags.writeable = False  # as `alpha` is: another kind of array would be another compilation
     transform, intrinsics = T_world_camera[:3].astype(np.float32), intrinsics_array(camera)
-    parameters = np.array(
-        [config.gate_sigma, config.gate_floor_m, config.min_cosine, config.free_space_margin_m, config.spread_pixels],
-        np.float32,
-    )
-    if index_map is None:
-        index_map, _ = render_index_map(surfels, candidates, T_world_camera, camera, config.stable_confidence)
-    action, row_counts = np.empty(camera.shape, np.uint8), np.empty(camera.height, np.int64)
-    a = surfels.arrays
-
-    def associate(start: int, stop: int) -> None:
-        kernels.associate_rows(
-            start,
-            stop,
-            index_map,
-            surface,
-            transform,
-            intrinsics,
-            parameters,
-            a.positions,
-            a.normals,
-            row_counts,
-            action,
-        )
+    parameters = np.array([
+        config.gate_sigma, config.gate_floor_m, config.min_cosine, config.free_space_margin_m, config.spread_pixels,
+        config.max_confidence,
+    ], np.float32)  # fmt: skip
+    if view is None:
+        view = render_model_view(surfels, candidates, T_world_camera, camera, config.stable_confidence, depth_buffers)
+    seen, image, pages = view.seen, view.image, surfels.pages
+    merged = np.zeros(camera.width * camera.height + 1, np.uint8)
+    pending, counts = np.empty(camera.shape, np.int32), np.empty(camera.height, np.int32)
 
     def merge(start: int, stop: int) -> None:
-        kernels.merge_rows(
-            start, stop, action, index_map, surface, color, alpha, transform, most, frame_id,
-            a.positions, a.normals, a.colors, a.radii, a.confidences, a.last_seen,
+        kernels.merge_pages(
+            start, stop, seen.slots, pages.counts, seen.landed, surface.reshape(-1), color.reshape(-1),
+            weights.reshape(-1), transform, parameters, camera.width, camera.height, frame_id, pages.pool, pages.whole,
+            pages.dirty, merged,
         )  # fmt: skip
 
-    # Two passes: every decision sees the map as it was, whichever thread comes first.
-    run_ranges(camera.height, associate)
-    if moving is not None:
-        demote(surfels, index_map, action, row_counts, moving)
-    run_ranges(camera.height, merge)
-    offsets = len(surfels) + np.concatenate([[0], np.cumsum(row_counts)])
-    new = int(offsets[-1]) - len(surfels)
-    b = surfels.reserve(new)
-
-    def append(start: int, stop: int) -> None:
-        kernels.append_rows(
-            start, stop, action, offsets, surface, color, alpha, transform, frame_id,
-            b.positions, b.normals, b.colors, b.radii, b.confidences, b.created, b.last_seen,
+    def cover(start: int, stop: int) -> None:
+        kernels.cover_rows(
+            start, stop, seen.numbers, image.reshape(-1), merged[:-1].reshape(camera.shape), surface.reshape(-1),
+            moving, transform, intrinsics, parameters, pending, counts,
         )  # fmt: skip
 
-    run_ranges(camera.height, append)
-    surfels.extend(new)
-    interval = max(config.clean_interval, len(surfels) // TIDIED_PER_FRAME)
-    removed = tidy(surfels, index_map, frame_id, config) if frame_id % interval == 0 else 0
-    return FusionCounts(new, removed)
+    run_ranges(len(seen.slots), merge)
+    run_ranges(camera.height, cover)
+    offsets = np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
+    new, anchor = int(offsets[-1]), surfels.anchor
+    rows = np.empty((kernels.ROWS, new), np.float32)
+    whole = rows.view(np.int32)
+
+    def make(start: int, stop: int) -> None:
+        kernels.new_surfels(
+            start, stop, pending, counts, offsets, surface, color, alpha, transform, frame_id, anchor, rows, whole
+        )
+
+    run_ranges(camera.height, make)
+    pages.add(rows)
+    return FusionCounts(new, tidy(surfels, frame_id, config))
 
 
-MOVED_CONFIDENCE = 1.0
-"""Confidence of a surfel that something moving lies on: that of one measurement (Keller et al. 2013, sec. 6)."""
-
-
-def demote(surfels: SurfelMap, index_map: Int32, action: UInt8, row_counts: Int64, moving: Bool) -> None:
-    """Take the `moving` pixels (H, W) out of the frame's actions, and the confidence of the surfels they lie on.
-
-    What they look through still counts as seen through. `action` (H, W) and `row_counts` (H,) are changed.
-    """
-    lies_on = index_map[moving & ((action & kernels.MERGE) > 0)]
-    confidences = surfels.arrays.confidences
-    confidences[lies_on] = np.minimum(confidences[lies_on], np.float32(MOVED_CONFIDENCE))
-    action[moving] &= kernels.SEEN_THROUGH
-    row_counts[:] = np.count_nonzero(action & kernels.APPEND, axis=1)
-
-
-TIDIED_PER_FRAME = 20_000
-"""A large map is tidied less often: sorting costs this many surfels a frame on average, about 1 ms on two cores."""
-
-
-def tidy(surfels: SurfelMap, index_map: Int32, frame_id: int, config: FusionConfig) -> int:
+def tidy(surfels: SurfelMap, frame_id: int, config: FusionConfig) -> int:
     """Drop surfels that stayed unstable for too long, or that free space has eaten up; returns how many.
 
-    The others are put into an order that is quick to walk: first those in view, as the image shows them, then the
-    rest as they were. Neighbours in the image that are neighbours in memory halve the time of view and fusion.
+    Only pages are looked at where a surfel may have to go.
     """
-    confidences = surfels.confidences
-    late = (confidences < config.stable_confidence) & (frame_id - surfels.created > config.unstable_frames)
-    kept = ~(late | (confidences <= 0))
-    removed = len(surfels) - int(np.count_nonzero(kept))
-    visible = index_map[index_map >= 0]
-    visible = visible[kept[visible]]
-    kept[visible] = False
-    surfels.keep(np.concatenate([visible, np.flatnonzero(kept)]))
-    return removed
+    if frame_id % config.clean_interval != 0:
+        return 0
+    pages = surfels.pages
+    late = frame_id - pages.probation.astype(np.int64) > config.unstable_frames
+    slots = np.flatnonzero((pages.counts > 0) & (late | (pages.dirty > 0)))
+    return surfels.clean(slots, frame_id, config.unstable_frames, config.stable_confidence)

@@ -1,7 +1,13 @@
 """Compiled kernels of the surfel map.
 
-Work is split by chunks of surfels or by image rows. Threads never write the same element: each splats into a depth
-buffer of its own, a surfel is merged only by the pixel it won, and new surfels go to places that a prefix sum gave out.
+The map is pages of `PAGE` surfels in one flat array: `pool` as float32, `whole` the same bytes as int32. Page `slot`
+begins at slot * SPAN; its row r, one number per surfel, is at r * STRIDE from there. Surfel k of it has the number
+slot * PAGE + k.
+
+Work is split by pages or by image rows. Threads never write the same element: each splats into a depth buffer of its
+own, and a surfel that won a pixel is the only one there. What
+needs surfels goes through the map page by page, because neighbours in a page are neighbours in the image, while the
+surfels of neighbouring pixels lie anywhere; what needs several surfels around a pixel reads the model image.
 """
 
 from __future__ import annotations
@@ -10,316 +16,508 @@ import numpy as np
 
 from scanweld.parallel import kernel
 
-CHUNK = 16384
-"""Surfels handled together; fixed, so that their order does not depend on the threads."""
+PAGE = 256
+"""Surfels of a page."""
+
+STRIDE = PAGE + 16
+"""Distance of a page's rows: 17 cache lines, so that equal places of different rows lie in different cache sets."""
+
+ROWS = 14
+"""Numbers per surfel: position, normal, confidence, radius, colour, created, last seen, anchor."""
+
+Y, Z, NX, NY, NZ, CONFIDENCE, RADIUS, RED, GREEN, BLUE, CREATED, LAST_SEEN, ANCHOR = (
+    np.uint64(row * STRIDE) for row in range(1, ROWS)
+)
+"""Distances of the rows from the first, x."""
+
+SPAN = ROWS * STRIDE
+"""Distance of the pages."""
 
 EMPTY = np.int64(0x7FFFFFFFFFFFFFFF)
 """A pixel of the depth buffer that nothing landed in."""
 
 
 @kernel
-def cull(start, stop, positions, count, transform, intrinsics, width, height, margin, far, ids, counts):
-    """List the surfels of chunks start..stop that are in view, with a margin in pixels.
+def cull_pages(counts, boxes, planes, slots):
+    """List the pages that are not wholly outside one of the planes (6, 4) n . x + d >= 0; returns how many.
 
-    ids (chunks * CHUNK,) int32: chunk c writes from c * CHUNK on; counts (chunks,) int64.
+    counts (P,) int32 surfels of each page; boxes (P, 6) float32 their lower and upper corners; slots (P,) int32: the
+    list.
     """
-    fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
-    left, top = -margin - cx, -margin - cy
-    right, bottom = np.float32(width) + margin - cx, np.float32(height) + margin - cy
-    for chunk in range(start, stop):
-        first = chunk * CHUNK
-        kept = first
-        for i in range(first, min(first + CHUNK, count)):
-            x, y, z = positions[0, i], positions[1, i], positions[2, i]
-            xc = transform[0, 0] * x + transform[0, 1] * y + transform[0, 2] * z + transform[0, 3]
-            yc = transform[1, 0] * x + transform[1, 1] * y + transform[1, 2] * z + transform[1, 3]
-            zc = transform[2, 0] * x + transform[2, 1] * y + transform[2, 2] * z + transform[2, 3]
-            seen = (zc > np.float32(0.01)) & (zc < far)
-            seen = (
-                seen & (fx * xc > left * zc) & (fx * xc < right * zc) & (fy * yc > top * zc) & (fy * yc < bottom * zc)
-            )
-            ids[kept] = i
-            kept += 1 if seen else 0
-        counts[chunk] = kept - first
+    listed = 0
+    for slot in range(len(counts)):
+        inside = counts[slot] > 0
+        for k in range(planes.shape[0]):
+            farthest = planes[k, 3]
+            for axis in range(3):
+                normal = planes[k, axis]
+                farthest += max(normal * boxes[slot, axis], normal * boxes[slot, 3 + axis])
+            inside = inside & (farthest >= 0)
+        slots[listed] = slot
+        listed += 1 if inside else 0
+    return listed
 
 
 @kernel
-def splat(start, stop, positions, normals, confidences, ids, counts, transform, intrinsics, stable, buffer):
-    """Put the listed surfels of chunks start..stop into a depth buffer (H, W) int64, one pixel each, nearest wins.
+def splat_pages(start, stop, slots, counts, pool, transform, intrinsics, stable, width, height, landed, buffer):
+    """Put the surfels of pages slots[start:stop] into a depth buffer (H * W,) int64, one pixel each, nearest wins.
 
     A key is the depth in micrometres and the surfel's number, so ties have one winner. A surfel below the `stable`
     confidence counts as further away by two percent, about three standard deviations of the depth noise: a speck does
-    not hide the surface it belongs to. Surfels seen from behind or nearly edge-on are left out.
+    not hide the surface it belongs to. Surfels seen from behind or nearly edge-on are left out. landed (P * PAGE,)
+    int32: the pixel of each surfel, -1 for none. Two loops: the first is vectorised, the second cannot be.
     """
-    height, width = buffer.shape
     fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
-    half = np.float32(0.5)
-    for chunk in range(start, stop):
-        for k in range(chunk * CHUNK, chunk * CHUNK + counts[chunk]):
-            i = ids[k]
-            x, y, z = positions[0, i], positions[1, i], positions[2, i]
-            xc = transform[0, 0] * x + transform[0, 1] * y + transform[0, 2] * z + transform[0, 3]
-            yc = transform[1, 0] * x + transform[1, 1] * y + transform[1, 2] * z + transform[1, 3]
-            zc = transform[2, 0] * x + transform[2, 1] * y + transform[2, 2] * z + transform[2, 3]
-            u = fx * xc / zc + cx + half
-            v = fy * yc / zc + cy + half
-            if (zc <= np.float32(0.01)) | (u < 0) | (v < 0) | (u >= np.float32(width)) | (v >= np.float32(height)):
-                continue
-            a, b, c = normals[0, i], normals[1, i], normals[2, i]
-            nx = transform[0, 0] * a + transform[0, 1] * b + transform[0, 2] * c
-            ny = transform[1, 0] * a + transform[1, 1] * b + transform[1, 2] * c
-            nz = transform[2, 0] * a + transform[2, 1] * b + transform[2, 2] * c
-            facing = -(nx * xc + ny * yc + nz * zc)
-            if facing < np.float32(0.1) * np.sqrt(xc * xc + yc * yc + zc * zc):
-                continue
-            if confidences[i] < stable:
-                zc *= np.float32(1.02)
-            key = (np.int64(zc * np.float32(1e6)) << np.int64(32)) | np.int64(i)
-            row, column = np.int64(v), np.int64(u)
-            if key < buffer[row, column]:
-                buffer[row, column] = key
+    half, nearest = np.float32(0.5), np.float32(0.01)
+    r00, r01, r02, t0 = transform[0, 0], transform[0, 1], transform[0, 2], transform[0, 3]
+    r10, r11, r12, t1 = transform[1, 0], transform[1, 1], transform[1, 2], transform[1, 3]
+    r20, r21, r22, t2 = transform[2, 0], transform[2, 1], transform[2, 2], transform[2, 3]
+    right, bottom = np.float32(width), np.float32(height)
+    # The camera's centre in the world: minus R^T t.
+    ox, oy, oz = -(r00 * t0 + r10 * t1 + r20 * t2), -(r01 * t0 + r11 * t1 + r21 * t2), -(r02 * t0 + r12 * t1 + r22 * t2)
+    micrometres = np.empty(PAGE, np.int32)
+    for s in range(start, stop):
+        slot, count = slots[s], counts[slots[s]]
+        base, first = np.uint64(slot) * np.uint64(SPAN), np.uint64(s) * np.uint64(PAGE)
+        for k in range(np.uint64(count)):
+            i = base + k
+            x, y, z = pool[i], pool[i + Y], pool[i + Z]
+            a, b, c, confidence = pool[i + NX], pool[i + NY], pool[i + NZ], pool[i + CONFIDENCE]
+            xc = r00 * x + r01 * y + r02 * z + t0
+            yc = r10 * x + r11 * y + r12 * z + t1
+            zc = r20 * x + r21 * y + r22 * z + t2
+            dx, dy, dz = x - ox, y - oy, z - oz
+            facing = -(a * dx + b * dy + c * dz)
+            depth = max(zc, nearest)
+            u, v = fx * xc / depth + cx + half, fy * yc / depth + cy + half
+            seen = (zc > nearest) & (u >= 0) & (v >= 0) & (u < right) & (v < bottom) & (facing > 0)
+            seen = seen & (facing * facing >= np.float32(0.01) * (dx * dx + dy * dy + dz * dz))
+            column, row = np.int32(min(max(u, np.float32(0)), right)), np.int32(min(max(v, np.float32(0)), bottom))
+            landed[first + k] = row * np.int32(width) + column if seen else np.int32(-1)
+            depth = depth * np.float32(1.02) if confidence < stable else depth
+            micrometres[k] = np.int32(min(depth, np.float32(2100)) * np.float32(1e6))
+        for k in range(np.uint64(count)):
+            pixel = landed[first + k]
+            if pixel >= 0:
+                key = (np.int64(micrometres[k]) << np.int64(32)) | (np.int64(slot) * np.int64(PAGE) + np.int64(k))
+                buffer[np.uint64(pixel)] = min(key, buffer[np.uint64(pixel)])
 
 
 @kernel
 def resolve(start, stop, buffers, index_map, row_counts):
-    """Rows start..stop of the index map: the nearest surfel over all threads' buffers (T, H, W), -1 where none."""
+    """Rows start..stop of the index map: the nearest surfel over all threads' buffers (T, H, W), -1 where none.
+
+    The buffers are empty afterwards.
+    """
     for v in range(start, stop):
         seen = 0
         for u in range(buffers.shape[2]):
             key = buffers[0, v, u]
+            buffers[0, v, u] = EMPTY
             for t in range(1, buffers.shape[0]):
                 key = min(key, buffers[t, v, u])
+                buffers[t, v, u] = EMPTY
             index_map[v, u] = np.int32(key & np.int64(0xFFFFFFFF)) if key != EMPTY else np.int32(-1)
             seen += 1 if key != EMPTY else 0
         row_counts[v] = seen
 
 
 @kernel
-def gather_view(
-    start,
-    stop,
-    index_map,
-    offsets,
-    positions,
-    normals,
-    confidences,
-    out_positions,
-    out_normals,
-    out_confidences,
-):
-    """Copy the surfels of index-map rows start..stop, row-major, to the columns that `offsets` (H,) gives out."""
+def copy_eight(source, i, target, j):
+    """Copy eight numbers from source[i] on to target[j]: all are read before any is written, so it is two moves."""
+    a, b, c, d = source[i], source[i + np.uint64(1)], source[i + np.uint64(2)], source[i + np.uint64(3)]
+    e, f = source[i + np.uint64(4)], source[i + np.uint64(5)]
+    g, h = source[i + np.uint64(6)], source[i + np.uint64(7)]
+    target[j], target[j + np.uint64(1)], target[j + np.uint64(2)], target[j + np.uint64(3)] = a, b, c, d
+    target[j + np.uint64(4)], target[j + np.uint64(5)] = e, f
+    target[j + np.uint64(6)], target[j + np.uint64(7)] = g, h
+
+
+@kernel
+def shade_pages(start, stop, slots, counts, landed, index_map, pool, image):
+    """Write what the surfels of pages slots[start:stop] that won a pixel are to the model image (H * W * 8,).
+
+    A pixel has position, normal, confidence and luminance (ITU-R BT.601). index_map (H * W,) int32; landed (P * PAGE,)
+    int32: see `splat_pages`; it becomes -1 for those that did not win their pixel.
+    """
+    tile, winners, pixels = np.empty(8 * PAGE, np.float32), np.empty(PAGE, np.int32), np.empty(PAGE, np.int32)
+    for s in range(start, stop):
+        slot, first, count = np.uint64(slots[s]), np.uint64(s) * np.uint64(PAGE), np.uint64(counts[slots[s]])
+        base, number = slot * np.uint64(SPAN), np.int32(slots[s]) * np.int32(PAGE)
+        for k in range(count):
+            red, green, blue = pool[base + k + RED], pool[base + k + GREEN], pool[base + k + BLUE]
+            j = k * np.uint64(8)
+            tile[j], tile[j + np.uint64(1)], tile[j + np.uint64(2)] = (
+                pool[base + k],
+                pool[base + k + Y],
+                pool[base + k + Z],
+            )
+            tile[j + np.uint64(3)], tile[j + np.uint64(4)] = pool[base + k + NX], pool[base + k + NY]
+            tile[j + np.uint64(5)], tile[j + np.uint64(6)] = pool[base + k + NZ], pool[base + k + CONFIDENCE]
+            tile[j + np.uint64(7)] = np.float32(0.299) * red + np.float32(0.587) * green + np.float32(0.114) * blue
+        won = np.uint64(0)
+        for k in range(count):  # no branch: which surfels win is hard to predict
+            pixel = landed[first + k]
+            winners[won], pixels[won] = np.int32(k), pixel
+            wins = (pixel >= 0) & (index_map[np.uint64(max(pixel, np.int32(0)))] == number + np.int32(k))
+            landed[first + k] = pixel if wins else np.int32(-1)
+            won += np.uint64(wins)
+        for n in range(won):
+            copy_eight(tile, np.uint64(winners[n]) * np.uint64(8), image, np.uint64(pixels[n]) * np.uint64(8))
+
+
+@kernel
+def list_pixels(start, stop, index_map, offsets, pixels):
+    """Write the filled pixels of index-map rows start..stop to the places that `offsets` (H,) gives out."""
+    width = index_map.shape[1]
     for v in range(start, stop):
         k = offsets[v]
-        for u in range(index_map.shape[1]):
-            i = index_map[v, u]
-            if i >= 0:
-                for axis in range(3):
-                    out_positions[axis, k] = positions[axis, i]
-                    out_normals[axis, k] = normals[axis, i]
-                out_confidences[k] = confidences[i]
+        for u in range(width):
+            if index_map[v, u] >= 0:
+                pixels[k] = v * width + u
                 k += 1
 
 
 @kernel
-def gather_intensities(start, stop, index_map, offsets, colors, out):
-    """Luminance (ITU-R BT.601) of the surfels of index-map rows start..stop, as `gather_view` orders them."""
-    for v in range(start, stop):
-        k = offsets[v]
-        for u in range(index_map.shape[1]):
-            i = index_map[v, u]
-            if i >= 0:
-                red, green, blue = colors[0, i], colors[1, i], colors[2, i]
-                out[k] = np.float32(0.299) * red + np.float32(0.587) * green + np.float32(0.114) * blue
-                k += 1
-
-
-APPEND, MERGE, SEEN_THROUGH = np.uint8(1), np.uint8(2), np.uint8(4)
-"""What a pixel asks of the map, as bits."""
-
-
-@kernel
-def agrees(i, qx, qy, qz, nx, ny, nz, gate, reach, min_cosine, positions, normals):
-    """Whether surfel i is within `gate` of q along the normal n, within `reach` of it in all, and faces as n does."""
-    dx, dy, dz = positions[0, i] - qx, positions[1, i] - qy, positions[2, i] - qz
+def agrees(dx, dy, dz, a, b, c, nx, ny, nz, gate, reach, min_cosine):
+    """Whether a surfel at d from a measurement is within `gate` of it along the normal n, within `reach` in all, and
+    its normal (a, b, c) faces as n does."""
     along = abs(nx * dx + ny * dy + nz * dz)
-    cosine = nx * normals[0, i] + ny * normals[1, i] + nz * normals[2, i]
+    cosine = nx * a + ny * b + nz * c
     return (along < gate) & (cosine > min_cosine) & (dx * dx + dy * dy + dz * dz < reach * reach)
 
 
 @kernel
-def associate_rows(
-    start, stop, index_map, surface, transform, intrinsics, parameters, positions, normals, row_counts, action
-):  # fmt: skip
-    """Decide for the pixels of rows start..stop what they do to the map; the map is only read.
+def is_seen_through(u, v, x, y, z, gate, margin, surface, width, height, transform):
+    """Whether a pixel and its neighbours look through a surfel (x, y, z), which stands in front of them all."""
+    if (v <= 0) | (v >= height - 1) | (u <= 0) | (u >= width - 1):
+        return False
+    nearest = np.float32(np.inf)
+    for dv in range(-1, 2):
+        for du in range(-1, 2):
+            nearest = min(nearest, surface[np.uint64(((v + dv) * width + u + du) * 8 + 2)])
+    # Depth of the surfel along the camera's axis: third row of the inverse rotation.
+    depth = (
+        transform[0, 2] * (x - transform[0, 3])
+        + transform[1, 2] * (y - transform[1, 3])
+        + transform[2, 2] * (z - transform[2, 3])
+    )
+    return depth < nearest - max(margin, np.float32(2) * gate)
 
-    surface (H, W, 8), see `SurfaceLevel.surface`; transform (3, 4) camera -> world; parameters (5,): gate in standard
-    deviations, gate floor [m], least cosine of agreeing normals, free-space margin [m], spread [pixels]; row_counts
-    (H,): new surfels; action (H, W) uint8: MERGE with the pixel's own surfel, APPEND a new one, the own surfel is
-    SEEN_THROUGH.
+
+@kernel
+def merge_pages(
+    start, stop, slots, counts, landed, surface, color, alpha, transform, parameters, width, height,
+    frame_id, pool, whole, dirty, merged,
+):  # fmt: skip
+    """Merge the surfels of pages slots[start:stop] with the pixels that they won: p <- (w p + alpha q) / (w + alpha).
+
+    The same for normal and colour (Keller et al. 2013, eq. 5-8). A surfel that is seen through loses the weight of the
+    pixel, one that a pixel of negative weight, which moves, lies on all but that of one measurement.
+
+    landed: see `shade_pages`; surface (H * W * 8,), see `SurfaceLevel.surface`; color (H * W * 3,) uint8; alpha
+    (H * W,) float32 weight of the measurement; transform (3, 4) camera -> world; parameters: see `fusion.fuse`; dirty
+    (P,) uint8: pages with a surfel that lost confidence; merged (H * W + 1,) uint8: pixels whose measurement is in the
+    map; the last is written in vain.
+    """
+    one, zero, margin = np.float32(1), np.float32(0), parameters[3]
+    seen, rows = np.zeros(8 * PAGE, np.float32), np.zeros(4 * STRIDE, np.float32)
+    verdicts, winners = np.empty(PAGE, np.int32), np.empty(PAGE, np.int32)
+    for s in range(start, stop):
+        slot, first, count = np.uint64(slots[s]), np.uint64(s) * np.uint64(PAGE), np.uint64(counts[slots[s]])
+        base = slot * np.uint64(SPAN)
+        won = np.uint64(0)
+        for k in range(count):  # no branch: which surfels won a pixel is hard to predict
+            winners[won] = np.int32(k)
+            won += np.uint64(landed[first + k] >= 0)
+        # What the pixels say, into rows: a loop so short that the processor waits for many pixels at once.
+        for n in range(won):
+            place = np.uint64(winners[n])
+            pixel = np.uint64(landed[first + place])
+            copy_eight(surface, pixel * np.uint64(8), seen, place * np.uint64(8))
+            j = pixel * np.uint64(3)
+            red, green, blue = color[j], color[j + np.uint64(1)], color[j + np.uint64(2)]
+            rows[place], rows[place + np.uint64(STRIDE)] = np.float32(red), np.float32(green)
+            rows[place + np.uint64(2 * STRIDE)], rows[place + np.uint64(3 * STRIDE)] = np.float32(blue), alpha[pixel]
+        merge_page(count, base, first, landed, seen, rows, transform, parameters, pool, verdicts)
+        nowhere = np.uint64(len(merged) - 1)
+        disagree = demoted = False
+        for k in range(count):
+            confirmed = (verdicts[k] == 1) & (rows[k + np.uint64(3 * STRIDE)] > zero)
+            whole[base + LAST_SEEN + k] = frame_id if confirmed else whole[base + LAST_SEEN + k]
+            disagree |= verdicts[k] == 2
+        for n in range(won):
+            place = np.uint64(winners[n])
+            merged[np.uint64(landed[first + place]) if verdicts[place] == 1 else nowhere] = 1
+            demoted |= (verdicts[place] == 1) & (rows[place + np.uint64(3 * STRIDE)] < zero)
+        if not (disagree | demoted):
+            continue
+        for k in range(count):
+            if verdicts[k] == 0:
+                continue
+            pixel, i = np.uint64(landed[first + k]), base + k
+            if verdicts[k] == 1:
+                if alpha[pixel] < zero:
+                    pool[i + CONFIDENCE] = min(pool[i + CONFIDENCE], one)
+                    dirty[slot] = 1
+                continue
+            v, u = np.int64(pixel) // width, np.int64(pixel) % width
+            gate = max(parameters[0] / surface[pixel * np.uint64(8) + np.uint64(6)], parameters[1])
+            x, y, z = pool[i], pool[i + Y], pool[i + Z]
+            if is_seen_through(u, v, x, y, z, gate, margin, surface, width, height, transform):
+                # Never below zero: a surfel that is confirmed after all takes the new measurement's place.
+                pool[i + CONFIDENCE] = max(pool[i + CONFIDENCE] - abs(alpha[pixel]), zero)
+                dirty[slot] = 1
+
+
+@kernel
+def merge_page(count, base, first, landed, seen, rows, transform, parameters, pool, verdicts):
+    """Merge surfels base.. of the pool with the pixels that they landed in; a vectorised loop, all masks.
+
+    seen (PAGE * 8,): the pixels' surfaces; rows (4 * STRIDE,): their colours (3) and weights. verdicts (PAGE,) int32: 1
+    where they agree, 2 where they do not, 0 where there is nothing to agree with.
+    """
+    one, zero = np.float32(1), np.float32(0)
+    sigmas, floor, min_cosine, most = parameters[0], parameters[1], parameters[2], parameters[5]
+    r00, r01, r02, t0 = transform[0, 0], transform[0, 1], transform[0, 2], transform[0, 3]
+    r10, r11, r12, t1 = transform[1, 0], transform[1, 1], transform[1, 2], transform[1, 3]
+    r20, r21, r22, t2 = transform[2, 0], transform[2, 1], transform[2, 2], transform[2, 3]
+    for k in range(count):
+        j = k * np.uint64(8)
+        x, y, z = seen[j], seen[j + np.uint64(1)], seen[j + np.uint64(2)]
+        a, b, c = seen[j + np.uint64(3)], seen[j + np.uint64(4)], seen[j + np.uint64(5)]
+        weight, radius = seen[j + np.uint64(6)], seen[j + np.uint64(7)]
+        red, green, blue = rows[k], rows[k + np.uint64(STRIDE)], rows[k + np.uint64(2 * STRIDE)]
+        more, here = rows[k + np.uint64(3 * STRIDE)], (landed[first + k] >= 0) & (weight > zero)
+        qx = r00 * x + r01 * y + r02 * z + t0
+        qy = r10 * x + r11 * y + r12 * z + t1
+        qz = r20 * x + r21 * y + r22 * z + t2
+        nx, ny, nz = r00 * a + r01 * b + r02 * c, r10 * a + r11 * b + r12 * c, r20 * a + r21 * b + r22 * c
+        i = base + k
+        px, py, pz, mx, my, mz = pool[i], pool[i + Y], pool[i + Z], pool[i + NX], pool[i + NY], pool[i + NZ]
+        confidence, width = pool[i + CONFIDENCE], pool[i + RADIUS]
+        gate = max(sigmas / max(weight, np.float32(1e-6)), floor)
+        alike = here & agrees(
+            px - qx, py - qy, pz - qz, mx, my, mz, nx, ny, nz, gate, np.float32(4) * radius + gate, min_cosine
+        )
+        verdicts[k] = np.int32(1) if alike else np.int32(2) if here else np.int32(0)
+        moved = alike & (more > zero)
+        add = more / max(confidence + more, np.float32(1e-12)) if moved else zero
+        keep = one - add
+        nx, ny, nz = keep * mx + add * nx, keep * my + add * ny, keep * mz + add * nz
+        length = one / np.sqrt(nx * nx + ny * ny + nz * nz)
+        pool[i] = keep * px + add * qx if moved else px
+        pool[i + Y] = keep * py + add * qy if moved else py
+        pool[i + Z] = keep * pz + add * qz if moved else pz
+        pool[i + NX] = nx * length if moved else mx
+        pool[i + NY] = ny * length if moved else my
+        pool[i + NZ] = nz * length if moved else mz
+        pool[i + CONFIDENCE] = min(confidence + more, most) if moved else confidence
+        # The finest view of a surface sets how large its surfels are; neighbours may be two of its pixels apart.
+        pool[i + RADIUS] = min(width, np.float32(2) * radius) if moved else width
+        pool[i + RED] = keep * pool[i + RED] + add * red
+        pool[i + GREEN] = keep * pool[i + GREEN] + add * green
+        pool[i + BLUE] = keep * pool[i + BLUE] + add * blue
+
+
+@kernel
+def cover_row(count, v, columns, seen, others, asked, transform, intrinsics, parameters, covered):
+    """Mark pixels of row v whose measurement a neighbour's surfel covers; a vectorised loop, all masks.
+
+    columns (W,) int32: the pixels; seen, others (W * 8,): their surfaces, and the neighbours' model pixels; asked (W,)
+    int32: 1 where there is such a neighbour; covered (W,) int32.
+    """
+    sigmas, floor, min_cosine, spread = parameters[0], parameters[1], parameters[2], parameters[4]
+    r00, r01, r02, t0 = transform[0, 0], transform[0, 1], transform[0, 2], transform[0, 3]
+    r10, r11, r12, t1 = transform[1, 0], transform[1, 1], transform[1, 2], transform[1, 3]
+    r20, r21, r22, t2 = transform[2, 0], transform[2, 1], transform[2, 2], transform[2, 3]
+    fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
+    below = np.float32(v) - cy
+    for n in range(count):
+        j = n * np.uint64(8)
+        x, y, z = seen[j], seen[j + np.uint64(1)], seen[j + np.uint64(2)]
+        a, b, c = seen[j + np.uint64(3)], seen[j + np.uint64(4)], seen[j + np.uint64(5)]
+        gate = max(sigmas / seen[j + np.uint64(6)], floor)
+        reach = np.float32(4) * seen[j + np.uint64(7)] + gate
+        px, py, pz = others[j], others[j + np.uint64(1)], others[j + np.uint64(2)]
+        mx, my, mz = others[j + np.uint64(3)], others[j + np.uint64(4)], others[j + np.uint64(5)]
+        dx, dy, dz = px - t0, py - t1, pz - t2
+        ex, ey = dx - (r00 * x + r01 * y + r02 * z), dy - (r10 * x + r11 * y + r12 * z)
+        ez = dz - (r20 * x + r21 * y + r22 * z)
+        nx, ny, nz = r00 * a + r01 * b + r02 * c, r10 * a + r11 * b + r12 * c, r20 * a + r21 * b + r22 * c
+        zc = r02 * dx + r12 * dy + r22 * dz
+        right = fx * (r00 * dx + r10 * dy + r20 * dz) - (np.float32(columns[n]) - cx) * zc
+        down = fy * (r01 * dx + r11 * dy + r21 * dz) - below * zc
+        near = right * right + down * down < spread * spread * zc * zc
+        near = near & (asked[n] > 0) & agrees(ex, ey, ez, mx, my, mz, nx, ny, nz, gate, reach, min_cosine)
+        covered[n] = np.int32(1) if near else np.int32(0)
+
+
+@kernel
+def cover_rows(
+    start, stop, index_map, image, merged, surface, moving, transform, intrinsics, parameters, pending, counts
+):
+    """List the pixels of rows start..stop that need a surfel: what they measure is not in the map.
+
+    Neither the pixel's own surfel took it in nor is a neighbour's surfel near enough; nor does it move. image
+    (H * W * 8,): see `shade_pages`; surface (H * W * 8,); moving (H, W) bool, or of another height where nothing moves;
+    pending (H, W) int32 columns, counts (H,) int32 how many of each row; see `merge_pages`.
     """
     height, width = index_map.shape
-    sigmas, floor, min_cosine, margin = parameters[0], parameters[1], parameters[2], parameters[3]
-    spread = parameters[4]
+    masked = moving.shape[0] == height
+    columns, asked, covered = np.empty(width, np.int32), np.empty(width, np.int32), np.empty(width, np.int32)
+    seen, others = np.empty(8 * width, np.float32), np.empty(8 * width, np.float32)
     for v in range(start, stop):
-        new = 0
-        for u in range(width):
-            action[v, u] = np.uint8(0)
-            s = surface[v, u]
-            if s[6] <= 0:
+        count, first = np.uint64(0), np.uint64(v) * np.uint64(width)
+        for u in range(np.uint64(width)):
+            columns[count] = np.int32(u)
+            wanted = (merged[v, u] == 0) & (surface[(first + u) * np.uint64(8) + np.uint64(6)] > 0)
+            count += np.uint64(wanted and not (masked and moving[v, u]))
+        for n in range(count):
+            copy_eight(surface, (first + np.uint64(columns[n])) * np.uint64(8), seen, n * np.uint64(8))
+        # A surfel that landed in a neighbouring pixel may still be near enough to this one's centre: those beside it
+        # are asked first, then those at its corners, and what one of them covers is off the list.
+        for k in range(8):
+            sign = 2 * (k & 1) - 1
+            dv, du = ((k >> 1) * sign, (1 - (k >> 1)) * sign) if k < 4 else ((k & 2) - 1, sign)
+            if (v + dv < 0) | (v + dv >= height):
                 continue
-            x, y, z = s[0], s[1], s[2]
-            qx = transform[0, 0] * x + transform[0, 1] * y + transform[0, 2] * z + transform[0, 3]
-            qy = transform[1, 0] * x + transform[1, 1] * y + transform[1, 2] * z + transform[1, 3]
-            qz = transform[2, 0] * x + transform[2, 1] * y + transform[2, 2] * z + transform[2, 3]
-            a, b, c = s[3], s[4], s[5]
-            nx = transform[0, 0] * a + transform[0, 1] * b + transform[0, 2] * c
-            ny = transform[1, 0] * a + transform[1, 1] * b + transform[1, 2] * c
-            nz = transform[2, 0] * a + transform[2, 1] * b + transform[2, 2] * c
-            gate = max(sigmas / s[6], floor)
-            reach = np.float32(4) * s[7] + gate
-            i = index_map[v, u]
-            if i >= 0 and agrees(i, qx, qy, qz, nx, ny, nz, gate, reach, min_cosine, positions, normals):
-                action[v, u] = MERGE
-                continue
-            # A surfel that landed in a neighbouring pixel may still be near enough to this one's centre.
-            covered = False
-            for dv in range(max(-1, -v), min(1, height - 1 - v) + 1):
-                for du in range(max(-1, -u), min(1, width - 1 - u) + 1):
-                    j = index_map[v + dv, u + du]
-                    if covered or j < 0 or j == i:
-                        continue
-                    dx, dy, dz = (
-                        positions[0, j] - transform[0, 3], positions[1, j] - transform[1, 3],
-                        positions[2, j] - transform[2, 3],
-                    )  # fmt: skip
-                    xc = transform[0, 0] * dx + transform[1, 0] * dy + transform[2, 0] * dz
-                    yc = transform[0, 1] * dx + transform[1, 1] * dy + transform[2, 1] * dz
-                    zc = transform[0, 2] * dx + transform[1, 2] * dy + transform[2, 2] * dz
-                    right = intrinsics[0] * xc / zc + intrinsics[2] - np.float32(u)
-                    down = intrinsics[1] * yc / zc + intrinsics[3] - np.float32(v)
-                    near = right * right + down * down < spread * spread
-                    covered = near and agrees(j, qx, qy, qz, nx, ny, nz, gate, reach, min_cosine, positions, normals)
-            if not covered:
-                action[v, u] = APPEND
-                new += 1
-            # Free space: the pixel and its neighbours look through a surfel that stands in front of them.
-            if (i >= 0) & (v > 0) & (v < height - 1) & (u > 0) & (u < width - 1):
-                nearest = z
-                for dv in range(-1, 2):
-                    for du in range(-1, 2):
-                        nearest = min(nearest, surface[v + dv, u + du, 2])
-                # Depth of the surfel along this camera's axis: third row of the inverse rotation.
-                depth = (
-                    transform[0, 2] * (positions[0, i] - transform[0, 3])
-                    + transform[1, 2] * (positions[1, i] - transform[1, 3])
-                    + transform[2, 2] * (positions[2, i] - transform[2, 3])
-                )
-                if depth < nearest - max(margin, np.float32(2) * gate):
-                    action[v, u] |= SEEN_THROUGH
-        row_counts[v] = new
+            for n in range(count):
+                u = columns[n]
+                beside = np.uint64(min(max(u + du, 0), width - 1))
+                number = index_map[v + dv, beside]
+                asked[n] = 1 if (number >= 0) & (number != index_map[v, np.uint64(u)]) else 0
+                copy_eight(image, (np.uint64((v + dv) * width) + beside) * np.uint64(8), others, n * np.uint64(8))
+            cover_row(count, v, columns, seen, others, asked, transform, intrinsics, parameters, covered)
+            left = np.uint64(0)
+            for n in range(count):
+                columns[left] = columns[n]
+                copy_eight(seen, n * np.uint64(8), seen, left * np.uint64(8))
+                left += np.uint64(covered[n] == 0)
+            count = left
+        for n in range(count):
+            pending[v, n] = columns[n]
+        counts[v] = count
 
 
 @kernel
-def merge_rows(
-    start, stop, action, index_map, surface, color, alpha, transform, most, frame_id,
-    positions, normals, colors, radii, confidences, last_seen,
-):  # fmt: skip
-    """Merge the pixels of rows start..stop with their own surfels: p <- (w p + alpha q) / (w + alpha).
+def new_surfels(start, stop, pending, counts, offsets, surface, color, alpha, transform, frame_id, anchor, rows, whole):
+    """Make surfels of the `pending` pixels of rows start..stop, from columns offsets[v] on of `rows` (ROWS, N).
 
-    The same for normal and colour (Keller et al. 2013, eq. 5-8). color (H, W, 3) uint8; alpha (H, W) float32 weight of
-    the measurement; most: largest confidence. A surfel lies in one pixel, so it has one writer.
+    rows is float32, whole the same memory as int32.
     """
-    one = np.float32(1)
     for v in range(start, stop):
-        for u in range(index_map.shape[1]):
-            i, more = index_map[v, u], alpha[v, u]
-            if action[v, u] & SEEN_THROUGH:
-                # Never below zero: a surfel that is confirmed after all takes the new measurement's place.
-                confidences[i] = max(confidences[i] - more, np.float32(0))
-            if (action[v, u] & MERGE) == 0:
-                continue
+        for k in range(counts[v]):
+            u, i = pending[v, k], offsets[v] + k
             s = surface[v, u]
-            weight = confidences[i]
-            keep = weight / (weight + more)
-            add = one - keep
-            m0, m1, m2 = np.float32(0), np.float32(0), np.float32(0)
             for axis in range(3):
                 r0, r1, r2, t = transform[axis, 0], transform[axis, 1], transform[axis, 2], transform[axis, 3]
-                positions[axis, i] = keep * positions[axis, i] + add * (r0 * s[0] + r1 * s[1] + r2 * s[2] + t)
-                colors[axis, i] = keep * colors[axis, i] + add * np.float32(color[v, u, axis])
-                m = keep * normals[axis, i] + add * (r0 * s[3] + r1 * s[4] + r2 * s[5])
-                normals[axis, i] = m
-                m0, m1, m2 = m1, m2, m
-            length = one / np.sqrt(m0 * m0 + m1 * m1 + m2 * m2)
-            for axis in range(3):
-                normals[axis, i] *= length
-            # The finest view of a surface sets how large its surfels are; neighbours may be two of its pixels apart.
-            radii[i] = min(radii[i], np.float32(2) * s[7])
-            confidences[i] = min(weight + more, most)
-            last_seen[i] = frame_id
+                rows[axis, i] = r0 * s[0] + r1 * s[1] + r2 * s[2] + t
+                rows[3 + axis, i] = r0 * s[3] + r1 * s[4] + r2 * s[5]
+                rows[8 + axis, i] = np.float32(color[v, u, axis])
+            rows[6, i], rows[7, i] = alpha[v, u], s[7]
+            whole[11, i], whole[12, i], whole[13, i] = frame_id, frame_id, anchor
 
 
 @kernel
-def append_rows(
-    start, stop, action, offsets, surface, color, alpha, transform, frame_id,
-    positions, normals, colors, radii, confidences, created, last_seen,
-):  # fmt: skip
-    """Write the new surfels of rows start..stop at the places `offsets` (H,) gives out."""
-    for v in range(start, stop):
-        k = offsets[v]
-        for u in range(action.shape[1]):
-            if (action[v, u] & APPEND) == 0:
+def find_cell(key, keys):
+    """Place of a key in a hash table (2^n,) int64 with linear probing, or the free place (-1) where it belongs."""
+    mask = np.uint64(len(keys) - 1)
+    k = (np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)) >> np.uint64(20) & mask
+    while (keys[k] != key) & (keys[k] >= 0):
+        k = (k + np.uint64(1)) & mask
+    return k
+
+
+@kernel
+def deposit(first, rows, per_cell, free, num_free, room, counts, boxes, cells, probation, keys, tails, pool, numbers):
+    """Put surfels rows[:, first:] (ROWS, N) into pages of their cells, until pages or room in the table run out.
+
+    per_cell: cells per metre; free (F,) int32: slots of free pages, the last `num_free` first; room: keys that may
+    still come into the table; counts, boxes, cells, probation: see `PagePool`; keys (2^n,) int64, -1 where free, tails
+    (2^n,) int32: the table of cells and the page that each fills; numbers (N,) int32: the surfels' numbers. Returns how
+    far it came, the free pages and the room that are left.
+    """
+    for k in range(first, rows.shape[1]):
+        x, y, z = rows[0, k], rows[1, k], rows[2, k]
+        key = np.int64(np.floor(x * per_cell)) + np.int64(1 << 20)
+        key = (key << np.int64(21)) | (np.int64(np.floor(y * per_cell)) + np.int64(1 << 20))
+        key = (key << np.int64(21)) | (np.int64(np.floor(z * per_cell)) + np.int64(1 << 20))
+        entry = find_cell(key, keys)
+        if keys[entry] < 0:
+            if room == 0:
+                return k, num_free, room
+            keys[entry], tails[entry] = key, -1
+            room -= 1
+        slot = tails[entry]
+        # A page that was released since, and may belong to another cell by now, is no longer this cell's.
+        if slot < 0 or (cells[slot] != key) | (counts[slot] == PAGE):
+            if num_free == 0:
+                return k, num_free, room
+            num_free -= 1
+            slot = free[num_free]
+            tails[entry], cells[slot], counts[slot] = slot, key, 0
+            probation[slot] = 0x7FFFFFFF
+            for axis in range(3):
+                boxes[slot, axis], boxes[slot, 3 + axis] = np.float32(1e9), np.float32(-1e9)
+        i = np.uint64(slot) * np.uint64(SPAN) + np.uint64(counts[slot])
+        for row in range(np.uint64(ROWS)):
+            pool[i + row * np.uint64(STRIDE)] = rows[row, k]
+        for axis in range(3):
+            boxes[slot, axis] = min(boxes[slot, axis], rows[axis, k])
+            boxes[slot, 3 + axis] = max(boxes[slot, 3 + axis], rows[axis, k])
+        numbers[k] = slot * PAGE + counts[slot]
+        counts[slot] += 1
+    return rows.shape[1], num_free, room
+
+
+@kernel
+def clean_pages(start, stop, slots, frame_id, unstable_frames, stable, pool, whole, counts, probation):
+    """Drop from pages slots[start:stop] what stayed unstable for too long or has no confidence left.
+
+    probation (P,) int32: the first frame of what is still unstable.
+    """
+    for s in range(start, stop):
+        slot = slots[s]
+        base = np.uint64(slot) * np.uint64(SPAN)
+        kept, earliest = np.uint64(0), 0x7FFFFFFF
+        for k in range(np.uint64(counts[slot])):
+            confidence, created = pool[base + CONFIDENCE + k], whole[base + CREATED + k]
+            if (confidence <= 0) | ((frame_id - created > unstable_frames) & (confidence < stable)):
                 continue
-            s = surface[v, u]
-            for axis in range(3):
-                positions[axis, k] = (
-                    transform[axis, 0] * s[0]
-                    + transform[axis, 1] * s[1]
-                    + transform[axis, 2] * s[2]
-                    + transform[axis, 3]
-                )
-                normals[axis, k] = transform[axis, 0] * s[3] + transform[axis, 1] * s[4] + transform[axis, 2] * s[5]
-                colors[axis, k] = np.float32(color[v, u, axis])
-            radii[k] = s[7]
-            confidences[k] = alpha[v, u]
-            created[k] = frame_id
-            last_seen[k] = frame_id
-            k += 1
+            if confidence < stable:
+                earliest = min(earliest, created)
+            if kept < k:
+                for row in range(np.uint64(ROWS)):
+                    whole[base + row * np.uint64(STRIDE) + kept] = whole[base + row * np.uint64(STRIDE) + k]
+            kept += np.uint64(1)
+        counts[slot], probation[slot] = kept, earliest
 
 
 @kernel
-def splat_discs(
-    start,
-    stop,
-    positions,
-    normals,
-    colors,
-    radii,
-    order,
-    transform,
-    intrinsics,
-    rows_per_part,
-    depth,
-    rgb,
-    shade,
-):
+def splat_discs(start, stop, slots, counts, pool, least, transform, intrinsics, rows_per_part, depth, rgb, shade):
     """Draw surfels as discs into image parts start..stop of `rows_per_part` rows each; for pictures.
 
-    order (N,) int32: surfels to draw. depth (H, W) float32 starts at inf; rgb, shade (H, W, 3) float32: colour and
-    world normal of the nearest disc at each pixel. A part is drawn by one thread, in the given order.
+    slots (P,) int32: pages to draw, of which surfels of the `least` confidence. depth (H, W) float32 starts at inf;
+    rgb, shade (H, W, 3) float32: colour and world normal of the nearest disc at each pixel. A part is drawn by one
+    thread, in the given order.
     """
     height, width = depth.shape
     fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
     for part in range(start, stop):
         first_row, last_row = part * rows_per_part, min((part + 1) * rows_per_part, height) - 1
-        for k in range(len(order)):
-            i = order[k]
-            x, y, z = positions[0, i], positions[1, i], positions[2, i]
+        for k in range(len(slots) * PAGE):
+            slot, place = slots[k // PAGE], k % PAGE
+            i = np.uint64(slot) * np.uint64(SPAN) + np.uint64(place)
+            if (place >= counts[slot]) or (pool[i + CONFIDENCE] < least):
+                continue
+            x, y, z = pool[i], pool[i + Y], pool[i + Z]
             zc = transform[2, 0] * x + transform[2, 1] * y + transform[2, 2] * z + transform[2, 3]
             if zc < np.float32(0.05):
                 continue
             yc = transform[1, 0] * x + transform[1, 1] * y + transform[1, 2] * z + transform[1, 3]
-            size = fy * radii[i] / zc + np.float32(0.75)
+            radius = pool[i + RADIUS]
+            size = fy * radius / zc + np.float32(0.75)
             v = fy * yc / zc + cy
             if (v + size < np.float32(first_row)) | (v - size > np.float32(last_row)):
                 continue
@@ -327,14 +525,15 @@ def splat_discs(
             u = fx * xc / zc + cx
             if (u + size < 0) | (u - size > np.float32(width - 1)):
                 continue
-            a, b, c = normals[0, i], normals[1, i], normals[2, i]
+            a, b = pool[i + NX], pool[i + NY]
+            c = pool[i + NZ]
             nx = transform[0, 0] * a + transform[0, 1] * b + transform[0, 2] * c
             ny = transform[1, 0] * a + transform[1, 1] * b + transform[1, 2] * c
             nz = transform[2, 0] * a + transform[2, 1] * b + transform[2, 2] * c
             plane = nx * xc + ny * yc + nz * zc
             if plane >= 0:
                 continue  # seen from behind
-            reach = radii[i] + np.float32(0.75) * zc / fx
+            reach = radius + np.float32(0.75) * zc / fx
             for row in range(max(first_row, int(np.ceil(v - size))), min(last_row, int(np.floor(v + size))) + 1):
                 for column in range(max(0, int(np.ceil(u - size))), min(width - 1, int(np.floor(u + size))) + 1):
                     rx, ry = (np.float32(column) - cx) / fx, (np.float32(row) - cy) / fy
@@ -345,5 +544,5 @@ def splat_discs(
                     if (dx * dx + dy * dy + dz * dz <= reach * reach) & (t < depth[row, column]):
                         depth[row, column] = t
                         for axis in range(3):
-                            rgb[row, column, axis] = colors[axis, i]
+                            rgb[row, column, axis] = pool[i + np.uint64(8 + axis) * Y]
                         shade[row, column, 0], shade[row, column, 1], shade[row, column, 2] = a, b, c

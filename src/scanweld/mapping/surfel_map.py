@@ -1,153 +1,113 @@
-"""Storage of surfels, and nothing else: structure of arrays, doubling capacity, a handful of mutators."""
+"""Storage of surfels, and nothing else: pages that are culled, cleaned and sorted one by one."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
 
 import numpy as np
 
-from scanweld.arrays import Array, Bool, Float32, Int32, UInt8
+from scanweld.arrays import Array, Bool, Float32, Float64, Int32, Int64, UInt8
 from scanweld.errors import InvalidInputError
 from scanweld.geometry.views import MapCorrection
+from scanweld.mapping import kernels
+from scanweld.mapping.kernels import PAGE, ROWS
+from scanweld.mapping.pages import PagePool
 from scanweld.parallel import run_ranges
 
-_COLUMNS: tuple[tuple[str, int, type], ...] = (
-    ("positions", 3, np.float32),
-    ("normals", 3, np.float32),
-    ("colors", 3, np.float32),
-    ("radii", 1, np.float32),
-    ("confidences", 1, np.float32),
-    ("created", 1, np.int32),
-    ("last_seen", 1, np.int32),
-    ("anchors", 1, np.int32),
-)
-
-
-_MOVED_AT_ONCE = 1 << 14
-"""Surfels moved at a time: the transforms of all at once would take more memory than the map."""
-
-ROW_PADDING = 2064
-"""Extra columns: 129 cache lines, so that neighbouring rows are 129 cache sets apart."""
-
-
-@dataclass(slots=True)
-class SurfelArrays:
-    """The arrays themselves, longer than the map; only mapping code sees them.
-
-    positions, normals (3, capacity) float32, world frame; colors (3, capacity) float32, RGB 0..255; radii [m],
-    confidences (capacity,) float32; created, last_seen (capacity,) int32, frame numbers; anchors (capacity,) int32,
-    keyframe numbers.
-    """
-
-    positions: Float32
-    normals: Float32
-    colors: Float32
-    radii: Float32
-    confidences: Float32
-    created: Int32
-    last_seen: Int32
-    anchors: Int32
-
-    @classmethod
-    def empty(cls, capacity: int) -> SurfelArrays:
-        """Allocate arrays for `capacity` surfels.
-
-        All rows lie in one block whose row length is not a power of two: equal positions in different rows would
-        otherwise fall into the same few sets of the cache and push each other out.
-        """
-        block = np.zeros((sum(rows for _, rows, _ in _COLUMNS), capacity + ROW_PADDING), np.float32)
-        columns: list[Array] = []
-        first = 0
-        for _, rows, kind in _COLUMNS:
-            column: Array = block[first : first + rows].view(kind)
-            columns.append(column if rows > 1 else column[0])
-            first += rows
-        return cls(*columns)
+_ROWS: dict[str, tuple[slice, type]] = {
+    "positions_m": (slice(0, 3), np.float32),
+    "normals": (slice(3, 6), np.float32),
+    "confidences": (slice(6, 7), np.float32),
+    "radii_m": (slice(7, 8), np.float32),
+    "colors": (slice(8, 11), np.float32),
+    "created": (slice(11, 12), np.int32),
+    "last_seen": (slice(12, 13), np.int32),
+    "anchors": (slice(13, 14), np.int32),
+}
+"""In which rows of a page a property is kept, and as what."""
 
 
 class SurfelMap:
     """A growing set of oriented discs with colour and confidence.
 
-    Properties return read-only views of the live surfels; they are valid until the map is changed.
+    Surfels live in pages, each of them within one cell of space (docs/decisions/0012-blocks.md): what is out of view
+    is passed over page by page, and neighbours in space are neighbours in memory.
+
+    Properties are read-only copies of the live surfels, page by page; new ones are not always the last.
     """
 
     def __init__(self, capacity: int = 1 << 16) -> None:
-        self._arrays = SurfelArrays.empty(max(16, capacity))
-        self._count = 0
+        self.pages = PagePool(-(-capacity // PAGE))
+        """The storage, for the kernels of fusion and rendering."""
         self.anchor = 0
         """Keyframe that new surfels move with."""
 
     def __len__(self) -> int:
-        return self._count
+        return int(self.pages.counts.sum())
 
     @property
     def capacity(self) -> int:
-        """Number of surfels that fit before the arrays are doubled."""
-        return int(self._arrays.radii.shape[0]) - ROW_PADDING
+        """Number of surfels that fit before the storage is doubled."""
+        return self.pages.capacity * PAGE
 
     @property
     def positions_m(self) -> Float32:
         """(3, N) float32, world frame [m]."""
-        return self._view("positions")
+        return self._column("positions_m")
 
     @property
     def normals(self) -> Float32:
         """(3, N) float32, world frame, unit."""
-        return self._view("normals")
+        return self._column("normals")
 
     @property
     def colors(self) -> UInt8:
-        """(3, N) uint8, RGB (a rounded copy; the map keeps fractions)."""
-        return np.clip(np.rint(self._view("colors")), 0, 255).astype(np.uint8)
+        """(3, N) uint8, RGB (rounded; the map keeps fractions)."""
+        colors = np.clip(np.rint(self._column("colors")), 0, 255).astype(np.uint8)
+        colors.flags.writeable = False
+        return colors
 
     @property
     def radii_m(self) -> Float32:
         """(N,) float32 [m]."""
-        return self._view("radii")
+        return self._column("radii_m")
 
     @property
     def confidences(self) -> Float32:
         """(N,) float32, sum of the measurements' weights."""
-        return self._view("confidences")
+        return self._column("confidences")
 
     @property
     def created(self) -> Int32:
         """(N,) int32, number of the frame that made the surfel."""
-        return self._view("created")
+        return self._column("created")
 
     @property
     def last_seen(self) -> Int32:
         """(N,) int32, number of the frame that last confirmed the surfel."""
-        return self._view("last_seen")
+        return self._column("last_seen")
 
     @property
     def anchors(self) -> Int32:
         """(N,) int32, keyframe that the surfel moves with."""
-        return self._view("anchors")
+        return self._column("anchors")
 
-    @property
-    def arrays(self) -> SurfelArrays:
-        """The storage, for the kernels of fusion and rendering: only the first ``len(map)`` columns are surfels."""
-        return self._arrays
+    def columns(self) -> dict[str, Array]:
+        """Return the map as named columns, in the order of the PLY file."""
+        p, n, c = self.positions_m, self.normals, self.colors
+        return {
+            "x": p[0], "y": p[1], "z": p[2], "nx": n[0], "ny": n[1], "nz": n[2],
+            "red": c[0], "green": c[1], "blue": c[2], "radius": self.radii_m, "confidence": self.confidences,
+        }  # fmt: skip
 
-    def reserve(self, more: int) -> SurfelArrays:
-        """Make room for `more` surfels behind the live ones and return the storage."""
-        needed, capacity = self._count + more, self.capacity
-        if needed > capacity:
-            while capacity < needed:
-                capacity *= 2
-            grown = SurfelArrays.empty(capacity)
-            for name, _, _ in _COLUMNS:
-                getattr(grown, name)[..., : self._count] = getattr(self._arrays, name)[..., : self._count]
-            self._arrays = grown
-        return self._arrays
+    def table(self) -> dict[str, Array]:
+        """Return a copy of everything the map holds, colours as float32 with their fractions; see `replace`."""
+        return {name: self._column(name).copy() for name in _ROWS}
 
-    def extend(self, more: int, anchor: int | None = None) -> None:
-        """Count `more` surfels that a kernel wrote behind the live ones; they move with `anchor`, or the map's own."""
-        if not 0 <= more <= self.capacity - self._count:
-            raise InvalidInputError(f"map: cannot extend by {more}, reserve first")
-        self._arrays.anchors[self._count : self._count + more] = self.anchor if anchor is None else anchor
-        self._count += more
+    def replace(self, table: Mapping[str, Array]) -> None:
+        """Hold what a table says, in the form of `table()`, instead of what the map held."""
+        self.pages = PagePool(-(-len(table["radii_m"]) // PAGE))
+        self._add(table)
 
     def append(
         self,
@@ -160,66 +120,93 @@ class SurfelMap:
         anchor: int | None = None,
     ) -> None:
         """Add surfels: positions, normals, colors (3, M), radii and confidences (M,); they move with a keyframe."""
-        more = len(radii_m)
-        arrays = self.reserve(more)
-        new = slice(self._count, self._count + more)
-        arrays.positions[:, new], arrays.normals[:, new], arrays.colors[:, new] = positions_m, normals, colors
-        arrays.radii[new], arrays.confidences[new] = radii_m, confidences
-        arrays.created[new] = arrays.last_seen[new] = frame_id
-        self.extend(more, anchor)
+        frames = np.full(len(radii_m), frame_id, np.int32)
+        anchors = np.full(len(radii_m), self.anchor if anchor is None else anchor, np.int32)
+        self._add({
+            "positions_m": positions_m, "normals": normals, "colors": colors, "radii_m": radii_m,
+            "confidences": confidences, "created": frames, "last_seen": frames, "anchors": anchors,
+        })  # fmt: skip
 
-    def take_in(self, other: SurfelMap) -> None:
-        """Add the surfels of another map in the same world, as they are: their keyframes and ages stay theirs."""
-        arrays, more = self.reserve(len(other)), slice(self._count, self._count + len(other))
-        for name, _, _ in _COLUMNS:
-            getattr(arrays, name)[..., more] = getattr(other.arrays, name)[..., : len(other)]
-        self._count += len(other)
+    def take_in(self, other: SurfelMap) -> Int64:
+        """Add the surfels of another map in the same world, as they are: their keyframes and ages stay theirs.
+
+        Returns at which places of the properties they are now (M,), in the order that they had.
+        """
+        return self._add(other.table())
 
     def remove(self, doomed: Bool) -> int:
-        """Drop the surfels where `doomed` (N,) is true, keeping the order of the others; returns how many went."""
-        if doomed.shape != (self._count,):
-            raise InvalidInputError(f"map: expected a mask of shape ({self._count},), got {doomed.shape}")
-        gone = int(np.count_nonzero(doomed))
-        if gone:
-            self.keep(np.flatnonzero(~doomed))
-        return gone
+        """Drop the surfels where `doomed` (N,) is true; returns how many went."""
+        if doomed.shape != (len(self),):
+            raise InvalidInputError(f"map: expected a mask of shape ({len(self)},), got {doomed.shape}")
+        last, live = 0, self.pages.live.tolist()
+        for slot, count in zip(live, self.pages.counts[live].tolist(), strict=True):
+            kept = ~doomed[last : last + count]
+            last += count
+            if not kept.all():
+                self.pages.shrink(slot, self.pages.page(slot)[:, kept])
+        return int(np.count_nonzero(doomed))
 
-    def keep(self, order: Array) -> None:
-        """Keep the surfels that `order` (M,) lists, each at most once, in that order, and drop the others."""
-        rows = [row for name, _, _ in _COLUMNS for row in np.atleast_2d(getattr(self._arrays, name))]
+    def clean(self, slots: Int64, frame_id: int, unstable_frames: int, stable_confidence: float) -> int:
+        """Drop from pages what is unstable after so many frames, or without confidence; returns how many went."""
+        pages, before, stable = self.pages, self.pages.counts[slots], np.float32(stable_confidence)
 
         def body(start: int, stop: int) -> None:
-            for row in rows[start:stop]:
-                row[: len(order)] = row[order]
+            kernels.clean_pages(
+                start, stop, slots, frame_id, unstable_frames, stable, pages.pool, pages.whole, pages.counts,
+                pages.probation,
+            )  # fmt: skip
 
-        run_ranges(len(rows), body)
-        self._count = len(order)
+        run_ranges(len(slots), body, grain=8)
+        pages.dirty[slots] = 0
+        after = pages.counts[slots]
+        for slot in slots[(after < before) & (after < PAGE // 4)].tolist():
+            pages.shrink(slot, pages.page(slot).copy())
+        return int((before - after).sum())
+
+    def pages_in(self, planes: Float64) -> Int32:
+        """Return the slots of the pages that may hold surfels on the inner side of all planes (6, 4)."""
+        return self.pages.inside(planes)
+
+    def rows_of(self, numbers: Array) -> Int64:
+        """Return at which place of the properties the surfels are that an index map names."""
+        live = self.pages.live
+        first = np.zeros(self.pages.capacity, np.int64)
+        first[live] = np.cumsum(self.pages.counts[live]) - self.pages.counts[live]
+        return np.asarray(first[numbers // PAGE] + numbers % PAGE)
 
     def apply_correction(self, correction: MapCorrection) -> None:
         """Move the surfels of each named keyframe by its T_new_old."""
-        arrays = self._arrays
-        table = np.tile(np.eye(4), (max(int(self.anchors.max(initial=0)), *correction.keyframe_ids, 0) + 1, 1, 1))
+        pages = self.pages
+        live, largest = pages.live, max(0, *correction.keyframe_ids.tolist())
+        table = np.tile(np.eye(4), (largest + 2, 1, 1))  # the last one is for the keyframes that stay
         table[correction.keyframe_ids] = correction.T_new_old
 
         def body(start: int, stop: int) -> None:
-            for first in range(start, stop, _MOVED_AT_ONCE):
-                some = slice(first, min(first + _MOVED_AT_ONCE, stop))
-                T = table[arrays.anchors[some]]
-                turned = np.einsum("nij,jn->in", T[:, :3, :3], arrays.positions[:, some])
-                arrays.positions[:, some] = turned + T[:, :3, 3].T
-                arrays.normals[:, some] = np.einsum("nij,jn->in", T[:, :3, :3], arrays.normals[:, some])
+            for slot in live[start:stop].tolist():
+                rows = pages.page(slot)
+                T = table[np.minimum(rows[13].view(np.int32), largest + 1)]
+                rows[0:3] = np.einsum("nij,jn->in", T[:, :3, :3], rows[0:3]) + T[:, :3, 3].T
+                rows[3:6] = np.einsum("nij,jn->in", T[:, :3, :3], rows[3:6])
+                pages.fit_box(slot)
+                pages.cells[slot] = -1  # its cell is another one now
 
-        run_ranges(self._count, body, grain=_MOVED_AT_ONCE)
+        run_ranges(len(live), body)
 
-    def columns(self) -> dict[str, Array]:
-        """Return the map as named columns, in the order of the PLY file."""
-        p, n, c = self.positions_m, self.normals, self.colors
-        return {
-            "x": p[0], "y": p[1], "z": p[2], "nx": n[0], "ny": n[1], "nz": n[2],
-            "red": c[0], "green": c[1], "blue": c[2], "radius": self.radii_m, "confidence": self.confidences,
-        }  # fmt: skip
+    def _add(self, table: Mapping[str, Array]) -> Int64:
+        """Add surfels that come with all their columns; returns their places."""
+        rows = np.empty((ROWS, len(table["radii_m"])), np.float32)
+        for name, (some, kind) in _ROWS.items():
+            rows[some] = np.asarray(table[name]).astype(kind).view(np.float32)
+        return self.rows_of(self.pages.add(rows))
 
-    def _view(self, name: str) -> Array:
-        view: Array = getattr(self._arrays, name)[..., : self._count]
-        view.flags.writeable = False
-        return view
+    def _column(self, name: str) -> Array:
+        rows, kind = _ROWS[name]
+        values: Array = np.empty((rows.stop - rows.start, len(self)), kind)
+        done = 0
+        for slot in self.pages.live.tolist():
+            page = self.pages.page(slot)
+            values[:, done : done + page.shape[1]] = page[rows].view(kind)
+            done += page.shape[1]
+        values = values if len(values) > 1 else values[0]
+        values.flags.writeable = False
+        return values

@@ -110,6 +110,7 @@ def accumulate(rows, count, sums):
 def point_to_plane_sums(
     start,
     stop,
+    bounds,
     positions,
     normals,
     transform,
@@ -122,7 +123,7 @@ def point_to_plane_sums(
     robust,
     partials,
 ):
-    """Sums of chunks start..stop into partials (chunks, SUMS) float64.
+    """Sums of parts start..stop into partials (parts, SUMS) float64; part k is points bounds[k]..bounds[k + 1].
 
     positions, normals (3, N) float32 in the source frame; transform (3, 4) float32 source -> target; target
     (H * W, 8) float32, see `SurfaceLevel.surface`; gate [m]; robust: Huber's threshold in standard deviations.
@@ -130,12 +131,11 @@ def point_to_plane_sums(
     moved = np.empty((4, BLOCK), np.float32)
     pixels = np.empty(BLOCK, np.int64)
     rows = np.empty((8, BLOCK), np.float32)
-    total = positions.shape[1]
-    for chunk in range(start, stop):
-        sums = partials[chunk]
+    for part in range(start, stop):
+        sums = partials[part]
         sums[:] = 0.0
-        for first in range(chunk * CHUNK, min((chunk + 1) * CHUNK, total), BLOCK):
-            count = min(BLOCK, min((chunk + 1) * CHUNK, total) - first)
+        for first in range(bounds[part], bounds[part + 1], BLOCK):
+            count = min(BLOCK, bounds[part + 1] - first)
             kept = project_block(first, count, positions, transform, intrinsics, width, height, moved, pixels)
             matched = point_to_plane_rows(
                 first, kept, moved, pixels, normals, transform, target, gate, min_cosine, robust, rows, sums

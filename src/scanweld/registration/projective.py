@@ -7,8 +7,7 @@ solved by Gauss-Newton with Huber weights on residuals in units of the depth noi
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -26,12 +25,13 @@ from scanweld.registration.gauss_newton import (
     spectrum,
     standard_deviation,
 )
+from scanweld.registration.photometric.filling import fill_free
 from scanweld.registration.photometric.refinement import (
+    PARTS,
     Gates,
     GeometricSums,
     Photometry,
     Refinement,
-    fill_free,
     refine_observed,
 )
 from scanweld.registration.photometric.residuals import LitPoints, LitTarget, half_grey
@@ -85,7 +85,7 @@ class ProjectiveConfig:
 
 @dataclass(frozen=True, slots=True)
 class ProjectiveStep:
-    """Sums of one iteration; residuals in standard deviations of the depth noise."""
+    """Sums of one iteration; residuals in standard deviations of the depth noise. `shares` add up to `equations`."""
 
     level: int
     equations: NormalEquations
@@ -94,6 +94,7 @@ class ProjectiveStep:
     num_inliers: int
     num_matched: int
     num_projected: int
+    shares: GeometricSums
 
 
 def projective_step(
@@ -106,6 +107,7 @@ def projective_step(
     centroid_m: Float64,
     radius_m: float,
     level: int = 0,
+    parts: int | None = None,
 ) -> ProjectiveStep:
     """Match source points by projection into `target` and sum the point-to-plane normal equations.
 
@@ -116,64 +118,62 @@ def projective_step(
     target : the image that is projected into, target frame = its camera's
     gate_m : largest distance of a correspondence [m]
     centroid_m, radius_m : of the source points in the target frame, for :class:`NormalEquations`
+    parts : sum so many contiguous shares of the points, each on its own
     """
-    chunks = -(-positions_m.shape[1] // kernels.CHUNK)
-    partials = np.empty((chunks, kernels.SUMS))
-    arguments = _kernel_arguments(T_target_source, target, gate_m, config)
-
-    def body(start: int, stop: int) -> None:
-        kernels.point_to_plane_sums(start, stop, positions_m, normals, *arguments, partials)
-
-    run_ranges(chunks, body)
+    partials = _partial_sums(positions_m, normals, T_target_source, target, gate_m, config, parts)
     sums = partials.sum(axis=0)
-    full = np.zeros((7, 7))
-    full[np.triu_indices(7)] = sums[:28]
-    information = full[:6, :6] + np.triu(full[:6, :6], 1).T
+    shares = _as_equations(partials)
+    information = shares.information.sum(axis=0)
     # Unit normals: the translation block's trace is the sum of the weights w / sigma^2.
     weight = float(np.trace(information[:3, :3]))
     matched = int(sums[30])
     return ProjectiveStep(
         level,
-        NormalEquations(information, full[:6, 6], weight, centroid_m, radius_m),
+        NormalEquations(information, shares.gradient.sum(axis=0), weight, centroid_m, radius_m),
         loss=float(sums[28] / matched) if matched else 0.0,
-        rmse_m=float(np.sqrt(max(full[6, 6], 0.0) / weight)) if weight > 0 else 0.0,
+        rmse_m=float(np.sqrt(max(sums[27], 0.0) / weight)) if weight > 0 else 0.0,
         num_inliers=int(sums[29]),
         num_matched=matched,
         num_projected=int(sums[31]),
+        shares=shares,
     )
 
 
-def _kernel_arguments(
-    T_target_source: Float64, target: SurfaceLevel, gate_m: float, config: ProjectiveConfig
-) -> tuple[Any, ...]:
-    """What `kernels.point_to_plane_sums` takes between the points and the sums."""
+def _partial_sums(
+    positions_m: Float32,
+    normals: Float32,
+    T_target_source: Float64,
+    target: SurfaceLevel,
+    gate_m: float,
+    config: ProjectiveConfig,
+    parts: int | None = None,
+) -> Float64:
+    """Return the sums (K, SUMS) of contiguous shares of the points, see :func:`~.kernels.point_to_plane_sums`."""
+    count = positions_m.shape[1]
+    if parts is None:
+        bounds = np.append(np.arange(0, count, kernels.CHUNK), count)
+    else:
+        bounds = np.linspace(0, count, parts + 1).astype(np.int64)
+    partials = np.empty((len(bounds) - 1, kernels.SUMS))
+    transform, intrinsics = T_target_source[:3].astype(np.float32), intrinsics_array(target.camera)
     height, width = target.camera.shape
-    return (
-        T_target_source[:3].astype(np.float32), target.surface.reshape(-1, 8), intrinsics_array(target.camera),
-        width, height, np.float32(gate_m), np.float32(config.min_cosine), np.float32(config.robust_sigma),
-    )  # fmt: skip
-
-
-def _shares(
-    end: _Descent, T_target_source: Float64, target: SurfaceLevel, config: ProjectiveConfig, parts: int
-) -> GeometricSums:
-    """Sum the normal equations of contiguous shares of the points of the finest level, each on its own."""
-    bounds = np.linspace(0, end.positions_m.shape[1], parts + 1).astype(np.int64).tolist()
-    sums = np.empty((parts, kernels.SUMS))
-    arguments = _kernel_arguments(T_target_source, target, config.fine_gate_m, config)
+    surface = target.surface.reshape(-1, 8)
+    limits = np.float32(gate_m), np.float32(config.min_cosine), np.float32(config.robust_sigma)
 
     def body(start: int, stop: int) -> None:
-        for part in range(start, stop):
-            share = slice(bounds[part], bounds[part + 1])
-            positions, normals = end.positions_m[:, share].copy(), end.normals[:, share].copy()
-            partials = np.empty((-(-positions.shape[1] // kernels.CHUNK), kernels.SUMS))
-            kernels.point_to_plane_sums(0, len(partials), positions, normals, *arguments, partials)
-            sums[part] = partials.sum(axis=0)
+        kernels.point_to_plane_sums(
+            start, stop, bounds, positions_m, normals, transform, surface, intrinsics, width, height, *limits, partials
+        )
 
-    run_ranges(parts, body)
-    full = np.zeros((parts, 7, 7))
+    run_ranges(len(partials), body)
+    return partials
+
+
+def _as_equations(partials: Float64) -> GeometricSums:
+    """Return the normal equations of each share."""
+    full = np.zeros((len(partials), 7, 7))
     rows, columns = np.triu_indices(7)
-    full[:, rows, columns] = full[:, columns, rows] = sums[:, :28]
+    full[:, rows, columns] = full[:, columns, rows] = partials[:, :28]
     return GeometricSums(full[:, :6, :6], full[:, :6, 6])
 
 
@@ -218,11 +218,17 @@ def align_projective(
         end = _descend(positions_m, normals, target, start, config, held)
         end.history[:0] = history
     last = end.history[-1]
+    information = last.equations.information
+    if end.parts is not None and not end.parts.observable.all():
+        # Along free directions there is noise, and no knowledge.
+        known = end.parts.basis * end.parts.observable @ np.linalg.inv(end.parts.basis)
+        information = known.T @ information @ known
     refined = None
     if photometry is not None and end.parts is not None and last.num_matched >= config.min_points:
         refined = _refine(end, photometry, target, config)
     if refined is not None and refined.used:
         end.T_target_source, end.parts = refined.T_target_source, refined.parts or end.parts
+        information = information + refined.information
     agreement = check_against_depth(end.positions_m, end.normals, end.T_target_source, target[0])
     overlap = last.num_matched / max(1, end.positions_m.shape[1])
     free = free_directions(last.equations, end.parts) if end.parts is not None and last.num_matched >= 6 else ()
@@ -232,7 +238,7 @@ def align_projective(
     return RegistrationResult(
         T_target_source=end.T_target_source,
         status=status,
-        information=last.equations.information + (refined.information if refined is not None and refined.used else 0.0),
+        information=information,
         num_iterations=len(end.history),
         num_inliers=last.num_inliers,
         overlap=overlap,
@@ -250,7 +256,7 @@ WEAK_CONSTRAINT = 0.05
 
 @dataclass(slots=True)
 class _Descent:
-    """Where the iterations ended, and the source points of the finest level."""
+    """Where the iterations ended, the last step, and the source points of the finest level."""
 
     T_target_source: Float64
     history: list[ProjectiveStep]
@@ -261,6 +267,7 @@ class _Descent:
     centroid_m: Float64
     radius_m: float
     stride: int = 1
+    xi: Float64 = field(default_factory=lambda: np.zeros(6))
 
 
 def _descend(
@@ -274,10 +281,10 @@ def _descend(
     """Iterate from the coarsest level to the finest; `held` as in :func:`~.gauss_newton.spectrum`."""
     coarsest = len(target) - 1
     end = _Descent(T_target_source, [], None, False, positions_m, normals, np.zeros(3), 1.0)
-    for level in range(coarsest, -1, -1):
-        stride = max(1, -(-positions_m.shape[1] // max(config.min_points, config.max_points >> (2 * level))))
+    for level, stride in _stages(positions_m.shape[1], coarsest, config):
         end.stride = stride
-        end.positions_m, end.normals = positions_m[:, ::stride].copy(), normals[:, ::stride].copy()
+        end.positions_m = np.ascontiguousarray(positions_m[:, ::stride])
+        end.normals = np.ascontiguousarray(normals[:, ::stride])
         few = end.positions_m[:, :: max(1, end.positions_m.shape[1] // 1000)]
         end.centroid_m, end.radius_m = _centroid_and_radius(se3.transform_points(end.T_target_source, few.T))
         gate = config.fine_gate_m * (config.coarse_gate_m / config.fine_gate_m) ** (level / max(coarsest, 1))
@@ -285,23 +292,36 @@ def _descend(
         for _ in range(config.iterations):
             step = projective_step(
                 end.positions_m, end.normals, end.T_target_source, target[level], gate, config,
-                end.centroid_m, end.radius_m, level,
+                end.centroid_m, end.radius_m, level, PARTS if level == 0 else None,
             )  # fmt: skip
             end.history.append(step)
             if step.num_matched < max(6, config.min_points >> (2 * level)):
                 break
             end.parts = spectrum(step.equations, held=held)
-            xi = solve(step.equations, end.parts)
-            end.T_target_source = se3.exp(xi) @ end.T_target_source
-            turn = float(np.linalg.norm(xi[3:]))
-            motion = float(np.linalg.norm(xi[:3] + np.cross(xi[3:], end.centroid_m))) + end.radius_m * turn
+            end.xi = solve(step.equations, end.parts)
+            end.T_target_source = se3.exp(end.xi) @ end.T_target_source
+            turn = float(np.linalg.norm(end.xi[3:]))
+            motion = float(np.linalg.norm(end.xi[:3] + np.cross(end.xi[3:], end.centroid_m))) + end.radius_m * turn
             # On the finest level a step within half a standard deviation of the estimate is noise. A coarse level need
             # only hand over a start within its pixel size.
-            noise = 0.5 * standard_deviation(step.equations, end.parts) if level == 0 else 0.0
-            if motion < max(config.step_m * 4**level, noise):
+            deviation = standard_deviation(step.equations, end.parts) if level == 0 else 0.0
+            if motion < max(config.step_m * 4**level, 0.5 * deviation):
                 end.converged = True
                 break
     return end
+
+
+def _stages(count: int, coarsest: int, config: ProjectiveConfig) -> Iterator[tuple[int, int]]:
+    """Yield level and stride through the points of each stage: few points lead there, all have the last word."""
+
+    def stride(level: int) -> int:
+        return max(1, -(-count // max(config.min_points, config.max_points >> (2 * level))))
+
+    for level in range(coarsest, 0, -1):
+        yield level, stride(level)
+    if stride(1) > stride(0):
+        yield 0, stride(1)
+    yield 0, stride(0)
 
 
 def _refine(
@@ -311,13 +331,15 @@ def _refine(
     points = LitPoints(end.positions_m, end.normals, photometry.intensities[:: end.stride].copy())
 
     def geometry(T_target_source: Float64, parts: int) -> GeometricSums:
-        return _shares(end, T_target_source, target[0], config, parts)
+        return _as_equations(
+            _partial_sums(end.positions_m, end.normals, T_target_source, target[0], config.fine_gate_m, config, parts)
+        )
 
     gates = Gates(config.fine_gate_m, config.min_cosine)
     assert end.parts is not None
     if end.parts.observable.all():
         lit = LitTarget(target[0], photometry.grey)
-        return refine_observed(end.T_target_source, points, lit, geometry, gates)
+        return refine_observed(end.T_target_source, points, lit, end.history[-1].shares.moved(end.xi), gates)
     greys = [photometry.grey]
     for _ in target[1:]:
         greys.append(half_grey(greys[-1]))

@@ -71,7 +71,8 @@ class RegistrationResult:
     covariance : of the estimate, in the order, perturbation and origin of `information`, from its scores;
         free directions have no finite variance: they are zero here and named in `unobservable`. None where the aligner
         makes no claim
-    unobservable : directions that the data leaves free; they stay at the initial guess
+    unobservable : directions that the data leaves free; they stay at the initial guess, but for what faint brightness
+        tells of them, whose little worth is in `information`
     note : one sentence for a person: why the status is not CONVERGED, and what was dropped; "" where nothing is amiss
     history : the steps, where asked for
     """

@@ -3,25 +3,38 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import groupby
 from pathlib import Path
 
 import numpy as np
 
-from scanweld.trajectory import FrameResult, FrameState
+from scanweld.report.stretches import KINDS, kind_of
+from scanweld.trajectory import FrameResult
 
-_BLUE, _GRAY, _RED = "#2563eb", "#6b7280", "#dc2626"
+_BLUE = "#2563eb"
+
+SHADES = {
+    "lost": "#dc2626",
+    "unreadable": "#6b7280",
+    "relocalised": "#0d9488",
+    "degenerate": "#d97706",
+    "unfinished": "#a16207",
+}
+"""Colours of frames that were not plainly tracked."""
 
 
 def plot_tracking(results: Sequence[FrameResult], path: Path) -> None:
-    """Draw loss, matched share, map size and time of every frame; lost and unreadable frames are shaded."""
+    """Draw loss, matched share, map size and time of every frame; the not plainly tracked are shaded."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
+    from matplotlib.patches import Patch
 
     figure = Figure(figsize=(9, 7), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots(4, 1, sharex=True)
     frames = np.arange(len(results))
-    aligned = np.array([bool(result.status) for result in results])
+    aligned = np.array([bool(result.status) and result.num_inliers > 0 for result in results])
+    kinds = [kind_of(result.state.value, result.status) for result in results]
     rows = (
         ("loss at the last iteration", [r.loss for r in results], "mean Huber loss", True),
         ("matched share of the visible map", [r.overlap for r in results], "share", True),
@@ -31,10 +44,8 @@ def plot_tracking(results: Sequence[FrameResult], path: Path) -> None:
     for axis, (title, values, label, tracked_only) in zip(axes, rows, strict=True):
         shown = np.where(aligned, values, np.nan) if tracked_only else np.asarray(values, dtype=np.float64)
         axis.plot(frames, shown, color=_BLUE, linewidth=1.3)
-        for frame, result in enumerate(results):
-            if result.state in (FrameState.LOST, FrameState.UNREADABLE):
-                color = _RED if result.state is FrameState.LOST else _GRAY
-                axis.axvspan(frame - 0.5, frame + 0.5, color=color, alpha=0.15, linewidth=0)
+        for kind, first, last in _stretches(kinds):
+            axis.axvspan(first - 0.5, last + 0.5, color=SHADES[kind], alpha=0.22, linewidth=0)
         axis.set_title(title, loc="left", fontsize=10)
         axis.set_ylabel(label, fontsize=9)
         axis.set_ylim(bottom=0)
@@ -47,7 +58,21 @@ def plot_tracking(results: Sequence[FrameResult], path: Path) -> None:
     axes[1].set_ylim(0, 1.05)
     axes[3].set_xlabel("frame")
     axes[3].set_xlim(-0.5, max(len(results) - 0.5, 0.5))
+    seen = [Patch(color=SHADES[kind], alpha=0.4, label=KINDS[kind].lower()) for kind in SHADES if kind in kinds]
+    if seen:
+        figure.legend(handles=seen, loc="outside upper right", ncols=len(seen), frameon=False, fontsize=9)
     figure.savefig(path, dpi=130)
+
+
+def _stretches(kinds: Sequence[str]) -> list[tuple[str, int, int]]:
+    """Return runs of frames of one kind: (kind, first, last); none for plainly tracked ones."""
+    found, first = [], 0
+    for kind, group in groupby(kinds):
+        count = len(list(group))
+        if kind:
+            found.append((kind, first, first + count - 1))
+        first += count
+    return found
 
 
 def plot_path(positions_m: np.ndarray, path: Path, title: str) -> None:

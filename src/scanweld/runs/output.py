@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import csv
 import json
+import logging
 import platform
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -26,10 +28,14 @@ from scanweld.io.trajectory_files import write_tum
 from scanweld.mapping.rendering import render_picture
 from scanweld.mapping.surfel_map import SurfelMap
 from scanweld.parallel import get_num_threads
+from scanweld.report.page import write_report
 from scanweld.report.plots import plot_path, plot_tracking
 from scanweld.slam.motion import trajectory_of
+from scanweld.slam.stages import LoopCloser
 from scanweld.slam.system import Slam, SlamConfig
 from scanweld.trajectory import FrameResult, Trajectory
+
+logger = logging.getLogger(__name__)
 
 RENDER_WIDTH = 800
 """Width of the pictures of the map [pixels]."""
@@ -55,8 +61,9 @@ def write_run(
     """Write every file of a run into an empty folder; metrics["seconds_total"] is brought up to date."""
     trajectory = slam.trajectory
     (folder / "config.toml").write_text(to_toml(config), encoding="utf-8")
-    write_tum(folder / "trajectory.txt", trajectory_of(slam.results, tracked_only=tracked_only))
+    write_tum(folder / "trajectory.txt", trajectory_of(slam.main_results, tracked_only=tracked_only))
     write_ply(folder / "map.ply", slam.map)
+    write_submaps(folder, slam)
     write_frames(folder / "frames.csv", slam.results)
     write_renders(folder / "renders", slam.map, trajectory, sequence.camera)
     plots = folder / "plots"
@@ -66,9 +73,25 @@ def write_run(
         plot_trajectory_error(error, plots / "trajectory.png", title=sequence.name)
     else:
         plot_path(trajectory.positions_m, plots / "trajectory.png", f"{sequence.name}: estimated path")
-    _write_json(folder / "run.json", {**_environment(config), **description})
+    if sequence.ground_truth is not None:
+        write_tum(folder / "groundtruth.txt", sequence.ground_truth)
+    write_keyframes(folder / "keyframes.csv", slam.loop_closer)
+    recording = {"name": sequence.name, "intrinsics": asdict(sequence.camera)}
+    _write_json(folder / "run.json", {**_environment(config), **recording, **description})
     metrics["seconds_total"] = time.perf_counter() - started
     _write_json(folder / "metrics.json", metrics)
+    try:
+        write_report(folder)
+    except Exception:  # the run is there and complete: a page about it can be made again, an hour of tracking cannot
+        logger.exception("report.html could not be made; `scanweld report` tries again")
+
+
+def write_submaps(folder: Path, slam: Slam) -> None:
+    """Write map-K.ply and trajectory-K.txt of each submap K that was not joined, in its own world."""
+    for submap in slam.unjoined:
+        write_ply(folder / f"map-{submap}.ply", slam.maps[submap])
+        mine = [result for result in slam.results if result.submap == submap]
+        write_tum(folder / f"trajectory-{submap}.txt", trajectory_of(mine, tracked_only=True))
 
 
 def write_frames(path: Path, results: Sequence[FrameResult]) -> None:
@@ -76,17 +99,32 @@ def write_frames(path: Path, results: Sequence[FrameResult]) -> None:
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(
-            ["frame", "timestamp", "status", "alignment", "rmse", "loss", "inliers", "overlap", "surfels"]
+            ["frame", "timestamp", "status", "alignment", "rmse", "loss", "inliers", "overlap", "surfels", "submap"]
             + [f"ms_{stage}" for stage in STAGES]
             + ["note"]
         )
         for r in results:
             writer.writerow(
                 [r.index, repr(r.timestamp_s), r.state.value, r.status, f"{r.rmse_m:.9g}", f"{r.loss:.9g}"]
-                + [r.num_inliers, f"{r.overlap:.6f}", r.num_surfels]
+                + [r.num_inliers, f"{r.overlap:.6f}", r.num_surfels, r.submap]
                 + [f"{r.stage_ms.get(stage, 0.0):.3f}" for stage in STAGES]
                 + [r.note]
             )
+
+
+def write_keyframes(path: Path, loop_closer: LoopCloser) -> None:
+    """Write the frame of every keyframe, and with which earlier keyframes' frames a loop ties it (space between)."""
+    database = getattr(loop_closer, "database", None)  # other loop closers may know no keyframes
+    if database is None:
+        return
+    frames = [keyframe.frame_index for keyframe in database.keyframes]
+    tied: dict[int, list[str]] = {}
+    for i, j in getattr(loop_closer, "loops", ()):
+        tied.setdefault(max(i, j), []).append(str(frames[min(i, j)]))
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(["frame", "loop"])
+        writer.writerows([frame, " ".join(tied.get(k, ()))] for k, frame in enumerate(frames))
 
 
 def write_renders(folder: Path, surfels: SurfelMap, trajectory: Trajectory, camera: PinholeCamera) -> None:

@@ -7,7 +7,7 @@ import logging
 import sys
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +15,17 @@ import numpy as np
 
 from scanweld.arrays import Float64
 from scanweld.datasets.base import RgbdSequence
+from scanweld.datasets.gyroscope import gyroscope_of
 from scanweld.datasets.images import check_depth_unit, explain_unusable_depth
 from scanweld.datasets.stream import stream
 from scanweld.errors import DatasetError, InvalidInputError
 from scanweld.evaluation.surface_metrics import compression_ratio
 from scanweld.evaluation.trajectory_metrics import AteResult, ate, rpe
+from scanweld.refinement.refine import Refinement
 from scanweld.runs.folder import check_writable, write_folder
 from scanweld.runs.output import write_run
+from scanweld.runs.refining import calibrate as calibrate_camera
+from scanweld.runs.refining import described
 from scanweld.slam.motion import POSED
 from scanweld.slam.system import Slam, SlamConfig, build_slam
 from scanweld.trajectory import FrameResult, FrameState, Trajectory
@@ -42,9 +46,10 @@ class RunSummary:
     ----------
     folder : where it was written, None when it was not
     metrics : what metrics.json holds
-    results : one per selected frame
-    map : the surfel map
+    results : one per selected frame, in the world of the map; frames of other submaps are LOST there
+    map : the surfel map, of the main submap
     interrupted : Ctrl-C ended it early; what was done until then was kept
+    refinements : what came of calibration and refinement, in that order, where they were asked for
     """
 
     folder: Path | None
@@ -52,6 +57,7 @@ class RunSummary:
     results: tuple[FrameResult, ...]
     map: Any
     interrupted: bool = False
+    refinements: tuple[Refinement, ...] = ()
 
     @property
     def trustworthy(self) -> bool:
@@ -84,6 +90,8 @@ def run_sequence(
     poses: Trajectory | None = None,
     progress: Progress | None = None,
     tracked_only: bool = False,
+    calibrate: bool = False,
+    refine: bool = False,
     description: Mapping[str, Any] | None = None,
     started: float | None = None,
 ) -> RunSummary:
@@ -98,6 +106,8 @@ def run_sequence(
     poses : fuse at these T_world_camera instead of tracking; frames without one within 0.02 s are skipped
     progress : called after each frame
     tracked_only : leave lines of frames without a measured pose out of trajectory.txt
+    calibrate : estimate intrinsics and depth from the keyframes, and where that helps run once more with them
+    refine : adjust the keyframes in the end; map and trajectory move with them (docs/refinement.md)
     description : goes into run.json; its "warnings" are put before those of the run
     started : `time.perf_counter()` from which seconds_total counts; default now
 
@@ -108,8 +118,10 @@ def run_sequence(
     DatasetError
         When no frame can be decoded.
     InvalidInputError
-        When no given pose belongs to a frame.
+        When no given pose belongs to a frame, or given poses are to be refined.
     """
+    if poses is not None and (calibrate or refine):
+        raise InvalidInputError("poses: given poses are not refined; leave out either poses, or refine and calibrate")
     started = time.perf_counter() if started is None else started
     config = config or SlamConfig()
     if out is not None:
@@ -118,8 +130,19 @@ def run_sequence(
     slam = build_slam(sequence.camera, config)
     tally = _Tally()
     interrupted = False
+    refinements: list[Refinement] = []
     try:
         _process_all(slam, sequence, given, tally, progress)
+        if calibrate:
+            calibrated, found = calibrate_camera(slam, sequence, config.refinement)
+            refinements.append(found)
+            if found.recalibrated:
+                again = build_slam(calibrated.camera, config)
+                _process_all(again, calibrated, None, _Tally(), progress)
+                slam, sequence = again, calibrated  # together: an interrupted second run leaves the first
+        if refine:
+            poses_alone = replace(config.refinement, calibrate_intrinsics=False, calibrate_depth=False)
+            refinements.append(slam.refine(sequence.camera, poses_alone))
     except KeyboardInterrupt:
         if not any(result.state in POSED for result in slam.results):
             raise  # there is nothing to keep
@@ -131,7 +154,7 @@ def run_sequence(
         raise DatasetError(f"{sequence.name}: no frame has usable depth, the map is empty; {why}")
     metrics, error = summarise(slam, sequence.ground_truth, tally.num_points_input)
     metrics["seconds_total"] = time.perf_counter() - started
-    summary = RunSummary(out, metrics, tuple(slam.results), slam.map, interrupted)
+    summary = RunSummary(out, metrics, tuple(slam.main_results), slam.map, interrupted, tuple(refinements))
     if out is not None:
         with write_folder(out, force=force) as aside:
             write_run(
@@ -141,6 +164,7 @@ def run_sequence(
                     **(description or {}),
                     "warnings": [*(description or {}).get("warnings", ()), *tally.warnings],
                     "interrupted": interrupted,
+                    **({"refinements": described(refinements)} if refinements else {}),
                 },
                 started=started,
             )  # fmt: skip
@@ -154,7 +178,10 @@ def _process_all(
     tally: _Tally,
     progress: Progress | None,
 ) -> None:
-    with contextlib.closing(stream(sequence)) as records:
+    gyroscope = gyroscope_of(sequence)
+    turned = [None] * len(sequence) if gyroscope is None else gyroscope.orientations(sequence.timestamps_s)
+    # Two frames ahead: a prepared one of 640x480 holds 20 MB.
+    with contextlib.closing(stream(sequence, 2, prepare=slam.prepare)) as records:
         for record in records:
             pose = given[record.index] if given is not None else None
             if record.frame is None:
@@ -171,7 +198,9 @@ def _process_all(
                     if advice:
                         tally.unit_doubted = True
                         tally.warn(advice)
-                result = slam.process(record.frame, T_world_camera=pose)
+                result = slam.process(
+                    record.frame, pyramid=record.prepared, T_world_camera=pose, orientation=turned[record.index]
+                )
             if progress is not None:
                 progress(result)
 
@@ -197,7 +226,8 @@ def _poses_by_frame(sequence: RgbdSequence, poses: Trajectory) -> list[Float64 |
 
 def summarise(slam: Slam, truth: Trajectory | None, num_points_input: int) -> tuple[dict[str, Any], AteResult | None]:
     """Return what metrics.json holds, but for seconds_total, and the trajectory error where there is a truth."""
-    results = slam.results
+    results = slam.main_results
+    apart = slam.unjoined
     states = [result.state for result in results]
     frame_ms = [sum(result.stage_ms.values()) for result in results if result.stage_ms]
     error: AteResult | None = None
@@ -218,6 +248,9 @@ def summarise(slam: Slam, truth: Trajectory | None, num_points_input: int) -> tu
         "frames_unreadable": states.count(FrameState.UNREADABLE),
         "relocalisations": states.count(FrameState.RELOCALISED),
         "loop_closures": slam.loop_closer.num_closures,
+        "submaps_joined": slam.atlas.num_joins,
+        "submaps_unjoined": len(apart),
+        "frames_in_unjoined_submaps": sum(r.state in POSED and r.submap in apart for r in slam.results),
         "ate_rmse_m": error.rmse_m if error else None,
         "ate_max_m": error.max_m if error else None,
         "rpe_trans_m": motion[0],

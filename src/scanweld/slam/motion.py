@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 
 from scanweld.arrays import Float64
 from scanweld.geometry import se3
+from scanweld.registration.result import RegistrationResult
 from scanweld.trajectory import FrameResult, FrameState, Trajectory
 
 POSED = (FrameState.TRACKING, FrameState.RELOCALISED)
@@ -26,37 +29,127 @@ within 0.5 ms would be carried on a hundredfold.
 """
 
 
+FASTEST = 3.0
+"""Standard deviation [m/s, rad/s] of the velocity of a camera of which nothing is known."""
+
+STEADIEST = 0.02
+"""The velocity of a camera that has stood still changes by so much [m/s, rad/s] in a second: it will be taken up."""
+
+
 class ConstantVelocity:
-    """Predicts that the camera goes on as it last moved; without measurements it slows down and stops."""
+    """Predicts that the camera goes on as it moved: a Kalman filter that takes its noises from the track itself.
+
+    The state is the pose, perturbed in the camera's own frame, T <- T exp(x), and the velocity, which changes at random
+    from frame to frame (:class:`Unsteadiness`). What a measurement leaves free is as sure as the camera moved evenly
+    before, and no surer; without any measurement the camera slows down and stops. While poses are measured in full the
+    last step says best where the next one begins, and the filter's smoother velocity waits for when they are not.
+    """
 
     def __init__(self, decay: float = 0.8) -> None:
         self.decay = decay
         self._T_world_camera: Float64 = np.eye(4)
         self._timestamp_s: float | None = None
-        self._velocity: Float64 = np.zeros(6)  # twist per second, in the camera's own frame
-        self._seen_velocity = self._velocity  # before misses slowed it down
-        self._seen_for_s = 0.0  # how long the motion was that the velocity comes from
+        self._velocity: Float64 = np.zeros(6)  # twist per second
+        self._covariance = _covariance(np.zeros(6), np.full(6, FASTEST**2))
+        self._unsteadiness = Unsteadiness()
+        self._seen_velocity = self._velocity  # from one measured pose to the next
+        self._seen_for_s = 0.0  # how long that motion was
         self._measured: tuple[float, Float64] | None = None  # when and where the camera was last seen
+        self._in_full = False  # whether the last frame was measured, and left nothing free
+        self._weighed: tuple[Float64, Float64] | None = None  # change of the state, and its covariance afterwards
 
     def predict(self, timestamp_s: float) -> Float64:
         """Return T_world_camera (4, 4) at a time."""
-        if self._timestamp_s is None:
-            return self._T_world_camera.copy()
-        elapsed = min(timestamp_s - self._timestamp_s, FARTHEST_AHEAD * self._seen_for_s)
-        return np.asarray(self._T_world_camera @ se3.exp(self._velocity * elapsed))
+        if self._measured is None or not self._in_full:
+            return self._filtered(timestamp_s)
+        return np.asarray(self._measured[1] @ se3.exp(self._seen_velocity * self._ahead_s(timestamp_s)))
+
+    def weigh(self, timestamp_s: float, aligned: RegistrationResult) -> RegistrationResult:
+        """Complete an alignment by what the motion knows better: all of what is free, a part of what is weakly held.
+
+        `aligned` : T_target_source is T_world_camera, `information` belongs to its left perturbation. The next call of
+        :meth:`observe` is about the answer.
+        """
+        if not aligned.unobservable:
+            return aligned
+        predicted, covariance = self._filtered(timestamp_s), self._covariance_at(timestamp_s)
+        to_world = se3.adjoint(aligned.T_target_source)
+        information = to_world.T @ aligned.information @ to_world
+        innovation = se3.log(se3.inverse(predicted) @ aligned.T_target_source)
+        # (P + R)^-1 from an information R^-1 that may be singular; the trace counts what it knows.
+        inverse = np.linalg.solve(np.eye(6) + information @ covariance[:6, :6], information)
+        known = max(1.0, float(np.trace(inverse @ covariance[:6, :6])))
+        # A camera that moves otherwise than expected along what is seen does so along what is not.
+        covariance = covariance * max(1.0, float(innovation @ inverse @ innovation) / known)
+        gain = covariance[:, :6] @ np.linalg.solve(np.eye(6) + information @ covariance[:6, :6], information)
+        change = gain @ innovation
+        self._weighed = change, covariance - gain @ covariance[:6]
+        return replace(aligned, T_target_source=predicted @ se3.exp(change[:6]))
 
     def observe(self, timestamp_s: float, T_world_camera: Float64, *, partly: bool = False) -> None:
         """Take in a measured pose.
 
-        One that is `partly` this model's own guess would only confirm that: the velocity stays what it was.
+        One that is `partly` this model's own guess would only confirm that: it counts as what :meth:`weigh` made of it.
         """
-        if self._measured is not None and timestamp_s > self._measured[0] and not partly:
-            # From measurement to measurement: what misses were guessed in between is no motion of the camera.
-            step = se3.inverse(self._measured[1]) @ T_world_camera
-            self._seen_for_s = timestamp_s - self._measured[0]
-            self._velocity = self._seen_velocity = se3.log(step) / self._seen_for_s
-        self._measured = timestamp_s, T_world_camera
-        self._T_world_camera, self._timestamp_s = T_world_camera, timestamp_s
+        before, self._measured = self._measured, (timestamp_s, T_world_camera)
+        missed = before is None or self._timestamp_s != before[0]
+        elapsed_s = 0.0 if before is None else timestamp_s - before[0]
+        if partly:
+            if self._weighed is not None:
+                self._velocity = self._velocity + self._weighed[0][6:]
+                self._covariance = self._weighed[1]
+            self._T_world_camera = T_world_camera
+            self._unsteadiness.interrupt()
+        elif before is None or elapsed_s <= 0:
+            self._restart(T_world_camera, self._velocity, FASTEST**2)
+        else:
+            step = se3.log(se3.inverse(before[1]) @ T_world_camera)
+            if missed:
+                # From measurement to measurement: what misses were guessed in between is no motion of the camera.
+                self._seen_velocity = step / elapsed_s
+                self._restart(T_world_camera, self._seen_velocity, 2 * self._unsteadiness.jitter / elapsed_s**2)
+            else:
+                self._correct(timestamp_s, T_world_camera)
+                # Where motions were free before, the step has their errors of many frames in it.
+                self._seen_velocity = step / elapsed_s if self._in_full else self._velocity
+            if self._in_full or missed:
+                self._unsteadiness.observe(step, elapsed_s)
+        if elapsed_s > 0:
+            self._seen_for_s = elapsed_s
+        self._timestamp_s, self._in_full, self._weighed = timestamp_s, not partly, None
+
+    def _restart(self, T_world_camera: Float64, velocity: Float64, variance: Float64 | float) -> None:
+        """Begin anew with a measured pose and a velocity of some variance."""
+        self._T_world_camera, self._velocity = T_world_camera, velocity
+        self._covariance = _covariance(self._unsteadiness.jitter, np.full(6, variance))
+        self._unsteadiness.interrupt()
+
+    def _correct(self, timestamp_s: float, T_world_camera: Float64) -> None:
+        """Correct the state by a pose that is measured in full."""
+        predicted, covariance = self._filtered(timestamp_s), self._covariance_at(timestamp_s)
+        jitter = np.diag(self._unsteadiness.jitter)
+        gain = np.linalg.solve(covariance[:6, :6] + jitter, covariance[:6]).T
+        change = gain @ se3.log(se3.inverse(predicted) @ T_world_camera)
+        self._T_world_camera = predicted @ se3.exp(change[:6])
+        self._velocity = self._velocity + change[6:]
+        self._covariance = covariance - gain @ covariance[:6]
+
+    def _filtered(self, timestamp_s: float) -> Float64:
+        return np.asarray(self._T_world_camera @ se3.exp(self._velocity * self._ahead_s(timestamp_s)))
+
+    def _ahead_s(self, timestamp_s: float) -> float:
+        """How far ahead of the last frame the motion is carried on [s]."""
+        if self._timestamp_s is None:
+            return 0.0
+        return min(timestamp_s - self._timestamp_s, FARTHEST_AHEAD * self._seen_for_s)
+
+    def _covariance_at(self, timestamp_s: float) -> Float64:
+        """Return the covariance (12, 12) of the prediction: the velocity changes, then the pose follows it."""
+        elapsed_s = 0.0 if self._timestamp_s is None else timestamp_s - self._timestamp_s
+        covariance = self._covariance + _covariance(np.zeros(6), self._unsteadiness.change(elapsed_s))
+        follow = np.eye(12)
+        follow[:6, 6:] = elapsed_s * np.eye(6)
+        return np.asarray(follow @ covariance @ follow.T)
 
     def move(self, T_new_old: Float64) -> None:
         """Take over that the world around the camera has moved (4, 4)."""
@@ -76,15 +169,78 @@ class ConstantVelocity:
 
     def forget(self) -> None:
         """Expect a camera that stands still: how it came to where it is was not seen."""
-        self._velocity = np.zeros(6)
+        self._velocity, self._in_full = np.zeros(6), False
+        self._covariance = _covariance(np.zeros(6), np.full(6, FASTEST**2))
         self._measured = None
+        self._unsteadiness.interrupt()
 
     def miss(self, timestamp_s: float) -> Float64:
         """Go on without a measurement, slower each time; returns T_world_camera (4, 4)."""
         T_world_camera = self.predict(timestamp_s)
+        self._covariance = self._covariance_at(timestamp_s)
+        self._velocity = (self._seen_velocity if self._in_full else self._velocity) * self.decay
         self._T_world_camera, self._timestamp_s = T_world_camera, timestamp_s
-        self._velocity = self._velocity * self.decay
+        self._in_full, self._weighed = False, None
         return T_world_camera
+
+
+class Unsteadiness:
+    """How unevenly a camera moves, and how much its measured poses jitter, from the track of the last seconds.
+
+    A step differs from the one before by a change of the velocity and by the jitter of three poses, d = c + n0 - 2 n1 +
+    n2: its variance is var(c) + 6 var(n), and the covariance with the next one -4 var(n). Both for translations and
+    for rotations, each alike along all axes.
+    """
+
+    WINDOW = 60
+    """Steps that are remembered."""
+
+    LEAST = 10
+    """Fewer tell nothing yet."""
+
+    def __init__(self) -> None:
+        self._differences: deque[tuple[float, Float64, Float64 | None]] = deque(maxlen=self.WINDOW)
+        self._last: tuple[float, Float64, Float64 | None] | None = None  # time, step, difference
+
+    def observe(self, step: Float64, elapsed_s: float) -> None:
+        """Take in the motion (6,) from one measured pose to the next."""
+        difference = None
+        if self._last is not None:
+            difference = step - self._last[1] * (elapsed_s / self._last[0])
+            self._differences.append((elapsed_s, difference, self._last[2]))
+        self._last = elapsed_s, step, difference
+
+    def interrupt(self) -> None:
+        """The next step does not follow the last one."""
+        self._last = None
+
+    @property
+    def jitter(self) -> Float64:
+        """Variances (6,) of a measured pose [m^2, rad^2]."""
+        return self._variances()[1]
+
+    def change(self, elapsed_s: float) -> Float64:
+        """Return the variances (6,) of the change of the velocity in a time [m^2/s^2, rad^2/s^2]."""
+        return self._variances()[0] * elapsed_s
+
+    def _variances(self) -> tuple[Float64, Float64]:
+        if len(self._differences) < self.LEAST:
+            return np.full(6, FASTEST**2), np.zeros(6)
+        times, differences = np.array([d[0] for d in self._differences]), np.array([d[1] for d in self._differences])
+        pairs = np.array([d[1] * d[2] for d in self._differences if d[2] is not None]).reshape(-1, 6)
+        variance = _alike(differences**2)
+        jitter = np.clip(-_alike(pairs) / 4, 0, variance / 6) if len(pairs) else np.zeros(6)
+        change = (variance - 6 * jitter) / np.mean(times) ** 3
+        return np.maximum(change, STEADIEST**2), np.asarray(jitter)
+
+
+def _alike(squares: Float64) -> Float64:
+    """Return the mean (6,) of rows (N, 6), the same for the three translations and for the three rotations."""
+    return np.repeat([squares[:, :3].mean(), squares[:, 3:].mean()], 3)
+
+
+def _covariance(of_pose: Float64, of_velocity: Float64) -> Float64:
+    return np.diag(np.concatenate([of_pose, of_velocity]))
 
 
 def trajectory_of(results: Sequence[FrameResult], *, tracked_only: bool = False) -> Trajectory:

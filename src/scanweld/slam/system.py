@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -13,70 +13,27 @@ import numpy.typing as npt
 from scanweld.arrays import Bool, Float64, as_transform
 from scanweld.config import check_ranges, section, setting
 from scanweld.errors import ConfigError, InvalidInputError
+from scanweld.geometry import se3
 from scanweld.geometry.camera import PinholeCamera
 from scanweld.geometry.depth import SurfaceConfig, SurfacePyramid, build_pyramid
 from scanweld.geometry.frame import Frame
 from scanweld.geometry.views import MapCorrection, ModelView
+from scanweld.loop_closure.joining import Join
 from scanweld.loop_closure.loop_closer import KeyframeLoopCloser, LoopClosingConfig, NoLoopCloser
 from scanweld.mapping.fusion import FusionConfig
 from scanweld.mapping.mapper import SurfelMapper
+from scanweld.parallel import limited_threads
+from scanweld.refinement.config import RefinementConfig
+from scanweld.refinement.refine import Refinement, refine_keyframes
 from scanweld.registration.result import RegistrationResult, Status
 from scanweld.slam.health import HealthConfig, TrackingHealth, is_near
 from scanweld.slam.motion import POSED, ConstantVelocity, trajectory_of
+from scanweld.slam.rotation_aid import RotationAid, as_rotation
+from scanweld.slam.stages import LoopCloser, Mapper, Tracker
+from scanweld.slam.submaps import Atlas, SubmapConfig, in_one_world, main_submap
 from scanweld.tracking.dynamics import DynamicsConfig, MotionDetector, leave_out, track_static
 from scanweld.tracking.tracker import FrameToModelTracker, TrackingConfig
 from scanweld.trajectory import FrameResult, FrameState, Trajectory
-
-
-class Tracker(Protocol):
-    """Finds the camera's pose against the map."""
-
-    def track(self, pyramid: SurfacePyramid, view: ModelView, T_world_camera: Float64) -> RegistrationResult:
-        """Align a frame with the map as seen from the predicted pose; T_target_source is T_world_camera."""
-        ...
-
-
-class Mapper(Protocol):
-    """Keeps the map."""
-
-    @property
-    def map(self) -> Any:
-        """The map; anything with a length."""
-        ...
-
-    def view(self, T_world_camera: Float64, camera: PinholeCamera) -> ModelView:
-        """Return the map as seen from a pose."""
-        ...
-
-    def fuse(self, pyramid: SurfacePyramid, T_world_camera: Float64, *, keyframe: int, moving: Bool | None) -> object:
-        """Merge a frame into the map, but for pixels (H, W) that move; what is new is corrected with a keyframe."""
-        ...
-
-    def apply(self, correction: MapCorrection) -> None:
-        """Move the map with its keyframes."""
-        ...
-
-
-class LoopCloser(Protocol):
-    """Recognises places, finds a lost camera, and corrects the map."""
-
-    @property
-    def keyframe(self) -> int:
-        """The keyframe that new surfels and frames move with."""
-        ...
-
-    @property
-    def num_closures(self) -> int:
-        """Number of loops closed so far."""
-        ...
-
-    def process(self, pyramid: SurfacePyramid, result: FrameResult) -> MapCorrection | None:
-        """Look at a tracked frame; return a correction when a loop was closed."""
-        ...
-
-    def relocalise(self, pyramid: SurfacePyramid) -> RegistrationResult:
-        """Look for a lost camera; only CONVERGED says that T_target_source is T_world_camera."""
-        ...
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -88,11 +45,13 @@ class SlamConfig:
     tracking: TrackingConfig = section(TrackingConfig, "how a frame is aligned with the map")
     fusion: FusionConfig = section(FusionConfig, "how a frame is merged into the map")
     health: HealthConfig = section(HealthConfig, "when a tracked pose is not believed")
+    submaps: SubmapConfig = section(SubmapConfig, "when a lost camera begins a new map")
     dynamics: DynamicsConfig = section(DynamicsConfig, "what counts as moving, and is kept out of the map")
     loop_closer: str = setting(
         "keyframes",
         "keyframes remembers places, finds a lost camera and closes loops; none does without: odometry alone",
     )
+    refinement: RefinementConfig = section(RefinementConfig, "how keyframes are adjusted after a run, if asked for")
     loop_closing: LoopClosingConfig = section(LoopClosingConfig, "how places are remembered, and loops closed")
 
     def __post_init__(self) -> None:
@@ -107,7 +66,9 @@ _LOOP_CLOSERS = ("keyframes", "none")
 class Slam:
     """Dense SLAM whose stages are given, each behind a Protocol; without `dynamics` the scene is taken to stand still.
 
-    The world frame is that of the first frame unless `T_world_first` says otherwise.
+    The world frame is that of the first frame unless `T_world_first` says otherwise. A camera that is lost for good
+    begins a submap with a world of its own (:mod:`~.submaps`): `map` and `trajectory` are those of the main one, which
+    has the most measured frames.
     """
 
     def __init__(
@@ -118,12 +79,13 @@ class Slam:
         loop_closer: LoopCloser | None = None,
         surfaces: SurfaceConfig | None = None,
         health: HealthConfig | None = None,
+        submaps: SubmapConfig | None = None,
         dynamics: DynamicsConfig | None = None,
         T_world_first: npt.ArrayLike | None = None,
     ) -> None:
         self.tracker = tracker
-        self.mapper = mapper
         self.loop_closer = loop_closer or NoLoopCloser()
+        self.atlas = Atlas(mapper, self.loop_closer, submaps)
         self.surfaces = surfaces or SurfaceConfig()
         self.results: list[FrameResult] = []
         self._keyframes: list[int] = []  # that each result moves with
@@ -131,33 +93,83 @@ class Slam:
         self._dynamics = MotionDetector(dynamics) if dynamics else None
         self._moving: Bool | None = None  # pixels (H, W) that move in the frame at hand
         self._motion = ConstantVelocity()
+        self._rotation = RotationAid()
         self._T_world_first = _near_pose(np.eye(4) if T_world_first is None else T_world_first, "T_world_first")
 
     @property
+    def mapper(self) -> Mapper:
+        """That of the submap that the camera is in."""
+        return self.atlas.mapper
+
+    @property
     def map(self) -> Any:
-        """The mapper's map."""
-        return self.mapper.map
+        """The map of the main submap."""
+        return self.maps[main_submap(self.results)]
+
+    @property
+    def maps(self) -> dict[int, Any]:
+        """The map of each submap, by its number in the results."""
+        return {submap: mapper.map for submap, mapper in self.atlas.mappers.items()}
+
+    @property
+    def unjoined(self) -> tuple[int, ...]:
+        """The submaps whose place in the world of the main one is not known."""
+        return tuple(submap for submap in self.atlas.mappers if submap != main_submap(self.results))
+
+    @property
+    def main_results(self) -> list[FrameResult]:
+        """The results in the world of the main submap; frames of other submaps are LOST there."""
+        return in_one_world(self.results, main_submap(self.results))
 
     @property
     def trajectory(self) -> Trajectory:
         """One pose per processed frame, LOST stretches interpolated where tracking was regained."""
-        return trajectory_of(self.results)
+        return trajectory_of(self.main_results)
 
-    def process(self, frame: Frame, *, T_world_camera: Float64 | None = None) -> FrameResult:
+    def prepare(self, frame: Frame) -> SurfacePyramid:
+        """Compute the surfaces of a frame as `process` does, with the caller's thread alone.
+
+        They depend on the frame and the configuration only: another thread may prepare the next frame meanwhile.
+        """
+        with limited_threads(1):
+            return build_pyramid(frame, self.surfaces)
+
+    def process(
+        self,
+        frame: Frame,
+        *,
+        pyramid: SurfacePyramid | None = None,
+        T_world_camera: Float64 | None = None,
+        orientation: Float64 | None = None,
+    ) -> FrameResult:
         """Take one frame through the system; with a given pose (4, 4) it is fused there and not tracked.
+
+        `pyramid` is what :meth:`prepare` made of the frame; without it that is done here. `orientation` is
+        R_reference_camera (3, 3) as a gyroscope has it; the reference is its own, but the same for all frames.
 
         Raises
         ------
         InvalidInputError
-            When the timestamp does not increase, or the given pose is no rigid transform.
+            When the timestamp does not increase, the given pose or orientation is no rigid transform, or the pyramid
+            is that of another frame.
         """
         clock = _Stopwatch()
         self._check_time(frame.timestamp_s)
+        if pyramid is not None and pyramid.frame is not frame:
+            raise InvalidInputError(
+                f"pyramid: it is that of the frame at {pyramid.frame.timestamp_s:.6f} s, expected the one at "
+                f"{frame.timestamp_s:.6f} s that is processed; pass what prepare(frame) returned"
+            )
         if T_world_camera is not None:
             T_world_camera = _near_pose(T_world_camera, "T_world_camera")
-        pyramid = build_pyramid(frame, self.surfaces)
+            if self.atlas.active != 0:
+                self._enter(0)  # given poses are in the world of the run
+        orientation = None if orientation is None else as_rotation(orientation, "orientation")
+        pyramid = pyramid or build_pyramid(frame, self.surfaces)
         clock.lap("surfaces")
-        predicted = self._motion.predict(frame.timestamp_s) if T_world_camera is None else T_world_camera
+        predicted = T_world_camera
+        if predicted is None:
+            predicted = self._rotation.predict(frame.timestamp_s, self._motion.predict(frame.timestamp_s), orientation)
         view = self.mapper.view(predicted, frame.camera)
         clock.lap("view")
         moved, self._moving = self._moving, None
@@ -166,7 +178,7 @@ class Slam:
         elif len(self.mapper.map) == 0:
             result = self._first(pyramid, predicted)
         else:
-            result = self._tracked(pyramid, view, predicted, moved)
+            result = self._begun_anew(pyramid, self._tracked(pyramid, view, predicted, moved))
         clock.lap("track")
         if result.state is not FrameState.LOST:  # a lost frame is never fused
             self.mapper.fuse(pyramid, result.T_world_camera, keyframe=self.loop_closer.keyframe, moving=self._moving)
@@ -174,15 +186,14 @@ class Slam:
                 self._dynamics.remember(pyramid, result.T_world_camera)
             partly = result.status == Status.DEGENERATE.value
             self._motion.observe(frame.timestamp_s, result.T_world_camera, partly=partly)
+            surely = result.status == Status.CONVERGED.value
+            self._rotation.observe(frame.timestamp_s, result.T_world_camera, surely=surely)
             clock.lap("fuse")
         elif len(self.mapper.map):
-            result = replace(result, T_world_camera=self._motion.miss(frame.timestamp_s))
+            result = replace(result, T_world_camera=self._rotation.turn(self._motion.miss(frame.timestamp_s)))
         result = self._keep(replace(result, num_surfels=len(self.mapper.map), stage_ms=clock.laps_ms))
         if result.state is not FrameState.LOST and T_world_camera is None:  # what was given is not corrected
-            still = pyramid if self._moving is None else leave_out(pyramid, self._moving)
-            correction = self.loop_closer.process(still, result)
-            if correction is not None:
-                self._correct(correction)
+            self._close_loops(pyramid if self._moving is None else leave_out(pyramid, self._moving), result)
             clock.lap("loop")
         return self.results[-1]
 
@@ -200,6 +211,35 @@ class Slam:
             )
         )
 
+    def refine(self, camera: PinholeCamera, config: RefinementConfig | None = None) -> Refinement:
+        """Adjust the keyframes of the main submap together; map and trajectory move with them where that fits better.
+
+        For use after the last frame. A calibration changes nothing here: the map is then to be made again with the
+        camera and depth of the result, as `run_sequence(..., calibrate=True)` does.
+
+        Parameters
+        ----------
+        camera : of the frames
+        config : what is estimated, and how; by default poses alone
+        """
+        database = getattr(self.loop_closer, "database", None)  # other loop closers may keep no keyframes
+        main = main_submap(self.results)
+        everything = () if database is None else database.keyframes
+        keyframes = [keyframe for keyframe in everything if self.results[keyframe.frame_index].submap == main]
+        refined = refine_keyframes(keyframes, camera, config)
+        if refined.better and not refined.recalibrated and database is not None:
+            poses = [keyframe.T_world_camera for keyframe in everything]
+            for index, pose in zip(refined.keyframe_ids.tolist(), refined.T_world_camera, strict=True):
+                poses[index] = pose
+            database.move(poses)
+            self.atlas.mappers[main].apply(refined.correction)
+            moved = refined.corrections_at(np.array([result.timestamp_s for result in self.results]))
+            self.results = [
+                replace(result, T_world_camera=T @ result.T_world_camera) if result.submap == main else result
+                for result, T in zip(self.results, moved, strict=True)
+            ]
+        return refined
+
     def _tracked(self, pyramid: SurfacePyramid, view: ModelView, predicted: Float64, moved: Bool | None) -> FrameResult:
         """Align a frame with the map where it is expected; a lost camera is looked for among the known places, too.
 
@@ -214,6 +254,8 @@ class Slam:
             aligned, moving = track_static(self.tracker.track, self._dynamics, pyramid, view, predicted, moved)
         else:
             aligned, moving = self.tracker.track(pyramid, view, predicted), None
+        if aligned.status is Status.DEGENERATE:
+            aligned = self._motion.weigh(frame.timestamp_s, aligned)
         if lost_for > _SHORT_LOSS and not (aligned.status.success and is_near(aligned.T_target_source, predicted)):
             return result  # the camera may be anywhere: what fits far from the guess fits by chance
         result = self._judged(frame, predicted, aligned)
@@ -222,6 +264,10 @@ class Slam:
         if result.state is FrameState.LOST and 0 < lost_for <= _SHORT_LOSS:
             found = self._found_again(pyramid, predicted)
             result = found if found.state is not FrameState.LOST else result
+        if result.state is FrameState.LOST and lost_for == 0:
+            T_model = self._motion.predict(frame.timestamp_s)
+            if not np.array_equal(T_model, predicted):  # it was the gyroscope that said where to look
+                return self._tracked(pyramid, self.mapper.view(T_model, frame.camera), T_model, moved)
         return result
 
     def _lost_for(self) -> int:
@@ -231,22 +277,65 @@ class Slam:
     def _found_again(self, pyramid: SurfacePyramid, predicted: Float64) -> FrameResult:
         """Look for a lost camera among the places that are known, and align it with the map there."""
         frame = pyramid.frame
-        found = self.loop_closer.relocalise(pyramid)
+        submap, found = self.atlas.look_for(pyramid)
         start = found.T_target_source
         if found.status.success:
-            aligned = self.tracker.track(pyramid, self.mapper.view(start, frame.camera), start)
+            aligned = self.tracker.track(pyramid, self.atlas.mappers[submap].view(start, frame.camera), start)
         if not (found.status.success and aligned.status.has_pose):
             return self._judged(frame, predicted, aligned if found.status.success else found)
         self._health = TrackingHealth(self._health.config)  # what was usual was so elsewhere
-        if self._motion.carried(frame.timestamp_s, start):
+        if submap != self.atlas.active:
+            self._enter(submap)
+        elif self._motion.carried(frame.timestamp_s, start):
             self._motion.forget()
         return self._judged(frame, start, aligned)
 
-    def _correct(self, correction: MapCorrection) -> None:
-        """Move the map, the frames so far and the camera with their keyframes."""
+    def _begun_anew(self, pyramid: SurfacePyramid, result: FrameResult) -> FrameResult:
+        """Begin a submap where a lost camera was looked for in vain long enough."""
+        if not self.atlas.gives_up(result, pyramid):
+            return result
+        T_world_camera = self.atlas.begin(pyramid, result.index)
+        if T_world_camera is None:
+            return result
+        self._enter(self.atlas.active)
+        note = f"no known place for {self.atlas.config.patience_s:g} s: submap {self.atlas.active} begins here"
+        return replace(self._placed(pyramid.frame, T_world_camera), note=note)
+
+    def _enter(self, submap: int) -> None:
+        """Go on in another submap: what was usual, and how the camera moved, was in another world."""
+        self.atlas.enter(submap)
+        self._health, self._motion = TrackingHealth(self._health.config), ConstantVelocity()
+        self._rotation.forget()
         if self._dynamics:
             self._dynamics.forget()
-        self.mapper.apply(correction)
+
+    def _close_loops(self, pyramid: SurfacePyramid, result: FrameResult) -> None:
+        """Let the loop closer look at a tracked frame, and do what follows."""
+        found = self.loop_closer.process(pyramid, result)
+        if isinstance(found, Join):
+            self._join(found, pyramid, result)
+        elif found is not None:
+            self.mapper.apply(found)
+            self._correct(found)
+
+    def _join(self, join: Join, pyramid: SurfacePyramid, result: FrameResult) -> None:
+        """Make one of two submaps, unless the frame does not fit the map of the other one where it should be."""
+        other, T_other_here = self.atlas.other(join)
+        start = T_other_here @ result.T_world_camera
+        view = self.atlas.mappers[other].view(start, pyramid.frame.camera)
+        aligned = self.tracker.track(pyramid, view, start)
+        if not (aligned.status.success and is_near(aligned.T_target_source, start)):
+            return
+        # The whole map knows better than a pair of keyframes how the two worlds lie to each other.
+        T_other_here = aligned.T_target_source @ se3.inverse(result.T_world_camera)
+        T = T_other_here if other == join.kept else se3.inverse(T_other_here)
+        self._correct(self.atlas.join(replace(join, T_kept_joined=T)))
+        self.results = [replace(r, submap=join.kept) if r.submap == join.joined else r for r in self.results]
+
+    def _correct(self, correction: MapCorrection) -> None:
+        """Move the frames so far and the camera with their keyframes, as the map was."""
+        if self._dynamics:
+            self._dynamics.forget()
         moved = dict(zip(correction.keyframe_ids.tolist(), correction.T_new_old, strict=True))
         self.results = [
             replace(result, T_world_camera=moved[keyframe] @ result.T_world_camera) if keyframe in moved else result
@@ -255,6 +344,7 @@ class Slam:
         now = moved.get(self.loop_closer.keyframe)
         if now is not None:
             self._motion.move(now)
+            self._rotation.move(now)
 
     def _first(self, pyramid: SurfacePyramid, predicted: Float64) -> FrameResult:
         """Start the map, unless there is nothing to start it with."""
@@ -308,6 +398,7 @@ class Slam:
             )
 
     def _keep(self, result: FrameResult) -> FrameResult:
+        result = replace(result, submap=self.atlas.active)
         self.results.append(result)
         self._keyframes.append(self.loop_closer.keyframe)
         return result
@@ -359,6 +450,7 @@ def build_slam(camera: PinholeCamera, config: SlamConfig | None = None, **stages
         "loop_closer": KeyframeLoopCloser(config.loop_closing) if config.loop_closer == "keyframes" else NoLoopCloser(),
         "surfaces": config.surfaces,
         "health": config.health,
+        "submaps": config.submaps,
         "dynamics": config.dynamics,
     }
     unknown = set(stages) - {*parts, "T_world_first"}

@@ -172,14 +172,15 @@ def _supported(level: SurfaceLevel, view: ModelView, T_world_camera: Float64) ->
     transform, intrinsics = se3.inverse(T_world_camera)[:3].astype(np.float32), intrinsics_array(level.camera)
     parameters = np.array([SUPPORT_SIGMAS, SUPPORT_FLOOR_M], np.float32)
     stable = np.float32(view.stable_confidence)
+    surfels = view.take(np.arange(0, len(view), stride, dtype=np.int64))
 
     def body(start: int, stop: int) -> None:
         kernels.mark_supported(
-            start, stop, stride, view.positions_m, view.confidences, stable, transform, intrinsics,
+            start, stop, surfels.positions_m, surfels.confidences, stable, transform, intrinsics,
             level.surface, parameters, supported,
         )  # fmt: skip
 
-    run_ranges(-(-len(view) // stride), body)
+    run_ranges(len(surfels.confidences), body)
     return supported
 
 
@@ -208,7 +209,7 @@ def leave_out(pyramid: SurfacePyramid, mask: Bool) -> SurfacePyramid:
         surface = level.surface.copy()
         surface[mask, 3:] = 0
         levels.append(replace(level, depth_m=np.where(mask, np.float32(0), level.depth_m), surface=surface))
-    return SurfacePyramid(pyramid.frame, tuple(levels))
+    return SurfacePyramid(pyramid.frame, tuple(levels), pyramid.grey)
 
 
 MIN_MASKED, MAX_MASKED = 0.005, 0.5

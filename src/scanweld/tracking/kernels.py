@@ -12,17 +12,16 @@ CLOSED, OPEN, SEED = np.uint8(0), np.uint8(1), np.uint8(2)
 
 @kernel
 def mark_supported(
-    start, stop, stride, positions, confidences, stable, transform, intrinsics, surface, parameters, supported
+    start, stop, positions, confidences, stable, transform, intrinsics, surface, parameters, supported
 ):  # fmt: skip
-    """Mark the pixels whose surface a stable surfel confirms; looks at surfels start..stop, counted in strides.
+    """Mark the pixels whose surface a stable surfel confirms; looks at surfels start..stop.
 
     transform (3, 4) world -> camera; parameters (2,): gate in standard deviations, gate floor [m]; supported (H, W)
     uint8 becomes 1. Threads write nothing but ones.
     """
     height, width = supported.shape
     half = np.float32(0.5)
-    for k in range(start, stop):
-        i = k * stride
+    for i in range(start, stop):
         if confidences[i] < stable:
             continue
         x, y, z = positions[0, i], positions[1, i], positions[2, i]

@@ -11,9 +11,8 @@ from scanweld.config import check_ranges, section, setting
 from scanweld.errors import ConfigError
 from scanweld.geometry import se3
 from scanweld.geometry.depth import SurfacePyramid
-from scanweld.geometry.views import ModelView
+from scanweld.geometry.views import ModelRows, ModelView
 from scanweld.registration.photometric.refinement import Photometry
-from scanweld.registration.photometric.residuals import luminance
 from scanweld.registration.projective import ProjectiveConfig, align_projective, schedules
 from scanweld.registration.result import RegistrationResult, Status
 from scanweld.registration.verification import Agreement, check_against_depth
@@ -87,8 +86,9 @@ class FrameToModelTracker:
         perturbation of it, in world axes. Free directions are named in the camera's axes; along these the pose is the
         predicted one.
         """
-        rows = self._rows(view)
-        scene = _Scene(*_taken(view, rows), pyramid, self._photometry(pyramid, view, rows))
+        rows, surfels = self._select(view)
+        light = self._photometry(pyramid, view, rows, surfels)
+        scene = _Scene(surfels.positions_m, surfels.normals, pyramid, light)
         T_camera_world = se3.inverse(T_world_camera)
         if rotation_prior is not None:
             T_camera_world = rotation_prior.turned(T_camera_world)
@@ -147,38 +147,38 @@ class FrameToModelTracker:
                 return result
         return best
 
-    def _select(self, view: ModelView) -> tuple[Float32, Float32]:
-        """Return the positions and normals (3, M) of the surfels to track against, in the order of the image."""
-        return _taken(view, self._rows(view))
-
-    def _rows(self, view: ModelView) -> Int64 | None:
-        """Choose the rows of the view to track against; None stands for all.
+    def _select(self, view: ModelView) -> tuple[Int64, ModelRows]:
+        """Choose the rows (M,) of the view to track against, in the order of the image.
 
         Where half of the view is stable, only stable surfels count: the others are mostly noise. A map that is young or
-        new to this place has nothing better than all of them.
+        new to this place has nothing better than all of them. Only an even share of the image is looked at, twice as
+        many as the aligner reads.
         """
-        stable = np.flatnonzero(view.confidences >= view.stable_confidence)
-        if len(stable) < MIN_STABLE_SHARE * len(view):
-            stable = np.arange(len(view))
-        wanted = max(round(self.config.stable_fraction * len(stable)), self.config.projective.min_points)
+        config = self.config
+        most = config.projective.max_points
+        rows = np.arange(0, len(view), max(1, int(len(view) * config.stable_fraction) // (2 * most)), dtype=np.int64)
+        surfels = view.take(rows)
+        stable = np.flatnonzero(surfels.confidences >= view.stable_confidence)
+        if len(stable) < MIN_STABLE_SHARE * len(rows):
+            stable = np.arange(len(rows))
+        wanted = max(round(config.stable_fraction * len(stable)), config.projective.min_points)
         if wanted < len(stable):
             # Confidence stops growing, so ties are the rule: those at the limit are taken evenly over the image.
-            confidences = view.confidences[stable]
+            confidences = surfels.confidences[stable]
             limit = np.partition(confidences, len(stable) - wanted)[len(stable) - wanted]
             above, tied = np.flatnonzero(confidences > limit), np.flatnonzero(confidences == limit)
             more = wanted - len(above)
             stable = stable[np.sort(np.concatenate([above, tied[np.arange(more) * len(tied) // more]]))]
-        # The aligner reads no more than this: an even share of the image, before anything is copied.
-        stable = stable[:: max(1, -(-len(stable) // self.config.projective.max_points))]
-        return None if len(stable) == len(view) else stable
+        stable = stable[:: max(1, -(-len(stable) // most))]
+        return (rows, surfels) if len(stable) == len(rows) else (rows[stable], surfels.take(stable))
 
-    def _photometry(self, pyramid: SurfacePyramid, view: ModelView, rows: Int64 | None) -> Photometry | None:
+    def _photometry(
+        self, pyramid: SurfacePyramid, view: ModelView, rows: Int64, surfels: ModelRows
+    ) -> Photometry | None:
         """Return the brightness of both sides where there is any and it is wanted."""
-        color = pyramid.frame.color
-        if not self.config.uses_photometry or color is None or view.intensities is None:
+        if not self.config.uses_photometry or pyramid.grey is None or surfels.intensities is None:
             return None
-        chosen = view.intensities if rows is None else view.intensities[rows]
-        return Photometry(chosen, luminance(color), view.index_map, view.intensities, rows)
+        return Photometry(surfels.intensities, pyramid.grey, view, rows)
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,9 +205,3 @@ def _is_far(result: RegistrationResult, T_target_source: Float64, config: Projec
     """Whether an answer is far from where it was expected."""
     shift, turn = np.split(se3.log(result.T_target_source @ se3.inverse(T_target_source)), 2)
     return bool(np.linalg.norm(shift) > config.coarse_gate_m or np.linalg.norm(turn) > FAR_TURN_RAD)
-
-
-def _taken(view: ModelView, rows: Int64 | None) -> tuple[Float32, Float32]:
-    if rows is None:
-        return view.positions_m, view.normals
-    return np.take(view.positions_m, rows, axis=1), np.take(view.normals, rows, axis=1)

@@ -62,10 +62,10 @@ def merge_doubled(surfels: SurfelMap, moved_m: Float32, most: float, config: Mer
     order = np.argsort(keys, kind="stable")
     rows, keys = rows[order], keys[order]
     cells, cell_of = np.unique(keys, return_inverse=True)
-    arrays = surfels.arrays
+    table = surfels.table()
     p, n, c, r, weights = (
-        np.ascontiguousarray(column[..., rows])
-        for column in (arrays.positions, arrays.normals, arrays.colors, arrays.radii, arrays.confidences)
+        np.ascontiguousarray(table[name][..., rows])
+        for name in ("positions_m", "normals", "colors", "radii_m", "confidences")
     )
     fineness = np.floor(np.log(np.maximum(r, 1e-6)) / np.log(_RADIUS_CLASS))
     ranking = np.lexsort((-weights, fineness)).astype(np.int64)
@@ -75,13 +75,14 @@ def merge_doubled(surfels: SurfelMap, moved_m: Float32, most: float, config: Mer
     limits = np.array([config.distance_m, _COSINE, most], np.float32)
     kernels.merge_layers(
         ranking, rank, cell_of.astype(np.int64).ravel(), _around(cells, keys), p, n, c, r, weights,
-        arrays.anchors[rows], config.gap, limits, taken,
+        table["anchors"][rows], config.gap, limits, taken,
     )  # fmt: skip
-    arrays.positions[:, rows], arrays.normals[:, rows], arrays.colors[:, rows] = p, n, c
-    arrays.confidences[rows] = weights
-    doomed = np.zeros(len(surfels), np.bool_)
-    doomed[rows[taken]] = True
-    return surfels.remove(doomed)
+    table["positions_m"][:, rows], table["normals"][:, rows], table["colors"][:, rows] = p, n, c
+    table["confidences"][rows] = weights
+    kept = np.ones(len(surfels), np.bool_)
+    kept[rows[taken]] = False
+    surfels.replace({name: column[..., kept] for name, column in table.items()})
+    return int(np.count_nonzero(taken))
 
 
 def _brought_together(surfels: SurfelMap, moved_m: Float32, gap: int) -> Bool:

@@ -15,15 +15,6 @@ SUMS = 48
 
 
 @kernel
-def luminance_rows(start, stop, color, out):
-    """Rows start..stop of the grey image (H, W) float32, 0..255, of color (H, W, 3) uint8 (ITU-R BT.601)."""
-    for v in range(start, stop):
-        for u in range(out.shape[1]):
-            red, green, blue = np.float32(color[v, u, 0]), np.float32(color[v, u, 1]), np.float32(color[v, u, 2])
-            out[v, u] = np.float32(0.299) * red + np.float32(0.587) * green + np.float32(0.114) * blue
-
-
-@kernel
 def photometric_rows(
     first, kept, moved, pixels, normals, intensities, transform, surface, grey, intrinsics, limits, model, rows, sums
 ):

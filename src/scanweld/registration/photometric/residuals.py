@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from scanweld.arrays import Bool, Float32, Float64, Int64, UInt8
-from scanweld.geometry.depth import SurfaceLevel, as_kernel_input, intrinsics_array
+from scanweld.arrays import Bool, Float32, Float64, Int64
+from scanweld.geometry.depth import SurfaceLevel, intrinsics_array
 from scanweld.parallel import run_ranges
 from scanweld.registration.photometric import kernels
 
@@ -82,15 +82,6 @@ class PhotometricSums:
     gradient: Float64
     loss: Float64
     matched: Int64
-
-
-def luminance(color: UInt8) -> Float32:
-    """Return the grey image (H, W) float32, 0..255, of a colour image (H, W, 3) uint8."""
-    color = as_kernel_input(color, np.uint8)
-    height, width = color.shape[0], color.shape[1]
-    grey = np.empty((height, width), np.float32)
-    run_ranges(height, lambda start, stop: kernels.luminance_rows(start, stop, color, grey))
-    return grey
 
 
 def half_grey(grey: Float32) -> Float32:

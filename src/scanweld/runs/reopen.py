@@ -1,0 +1,125 @@
+"""A finished run opened again: its sequence, and where each frame was."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from scanweld.arrays import Bool, Float64, Int64
+from scanweld.datasets.base import RgbdSequence, WrappedSequence
+from scanweld.datasets.intrinsics import parse_intrinsics
+from scanweld.datasets.open import open_sequence
+from scanweld.errors import DatasetError, FileFormatError
+from scanweld.geometry.camera import PinholeCamera
+from scanweld.geometry.frame import Frame
+from scanweld.io.trajectory_files import read_trajectory
+from scanweld.refinement.calibration import DepthCorrection
+from scanweld.report.run_files import FrameTable, poses_of_frames, read_frames
+from scanweld.runs.calibrated import CalibratedSequence
+from scanweld.runs.folder import KIND, MARK
+
+
+@dataclass(frozen=True, slots=True)
+class PosedFrames:
+    """The frames of a run whose pose was measured, in the world of its map.
+
+    Attributes
+    ----------
+    rows : (N,) their numbers in the run
+    T_world_camera : (N, 4, 4)
+    """
+
+    rows: Int64
+    T_world_camera: Float64
+
+    def select(self, chosen: Bool | Int64) -> PosedFrames:
+        """Return the chosen ones, a mask or indices."""
+        return PosedFrames(self.rows[chosen], self.T_world_camera[chosen])
+
+
+@dataclass(frozen=True, slots=True)
+class PickedSequence(WrappedSequence):
+    """The frames of `base` with the numbers `rows`."""
+
+    rows: Int64
+
+    @property
+    def timestamps_s(self) -> Float64:
+        """Time of the picked frames (N,) [s]."""
+        return self.base.timestamps_s[self.rows]
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def read(self, index: int) -> Frame:
+        """Decode picked frame `index`."""
+        return self.base.read(int(self.rows[index]))
+
+
+def read_description(folder: Path) -> Mapping[str, Any]:
+    """Return what run.json of a run folder holds.
+
+    Raises
+    ------
+    FileFormatError
+        When the folder is no run folder.
+    """
+    path = folder / MARK
+    if not path.is_file():
+        raise FileFormatError(f"{folder}: is no {KIND} (no {MARK}); `scanweld slam SEQUENCE --out RUN` makes one")
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, ValueError) as error:
+        raise FileFormatError(f"{path}: not readable JSON: {error}") from None
+    if not isinstance(content, dict):
+        raise FileFormatError(f"{path}: expected a JSON object, got {type(content).__name__}")
+    return content
+
+
+def posed_frames(folder: Path) -> PosedFrames:
+    """Return where the frames of a run were.
+
+    Raises
+    ------
+    FileFormatError
+        When frames.csv or trajectory.txt cannot be read.
+    """
+    frames: FrameTable = read_frames(folder / "frames.csv")
+    poses, known = poses_of_frames(frames, read_trajectory(folder / "trajectory.txt", "tum"))
+    kept = frames.posed & known
+    return PosedFrames(frames.number[kept], poses[kept])
+
+
+def reopen_sequence(run: Mapping[str, Any]) -> RgbdSequence:
+    """Open the sequence of a run as it was opened for the run, calibrated if it was.
+
+    Parameters
+    ----------
+    run : what run.json holds
+
+    Raises
+    ------
+    DatasetError
+        When the sequence is not there any more, or is another one by now.
+    """
+    place = Path(str(run.get("input") or ""))
+    if not run.get("input") or not place.exists():
+        raise DatasetError(f"the sequence of the run is not there any more: {run.get('input') or 'it has no path'}")
+    options: dict[str, Any] = {"topics": run["topics"]} if run.get("topics") else {}
+    sequence = open_sequence(
+        place,
+        format=run.get("format") or "auto",
+        camera=parse_intrinsics(run["camera"]) if run.get("camera") else None,
+        depth_scale=run.get("depth_scale"),
+        frames=run.get("frames"),
+        scale=run.get("scale") or 1.0,
+        **options,
+    )
+    found = run.get("refinements")
+    if run.get("calibrate") and found:
+        camera = PinholeCamera(**found[0]["intrinsics"])
+        return CalibratedSequence(sequence, camera, DepthCorrection(found[0]["inverse_depth_offset_per_m"]))
+    return sequence
