@@ -88,7 +88,7 @@ def reference_fuse(
     old = values_of(surfels)
     new = {name: values.copy() for name, values in old.items()}
     appended: dict[str, list[object]] = {name: [] for name in ALL}
-    R, t = T[:3, :3], T[:3, 3]
+    R, t, unmatched = T[:3, :3], T[:3, 3], []
     for v, u in np.ndindex(*camera.shape):
         row, i, color = surface[v, u], index_map[v, u], pyramid.frame.color[v, u].astype(float)
         if row[6] == 0:
@@ -96,12 +96,15 @@ def reference_fuse(
         q, n, weight = R @ row[:3] + t, R @ row[3:6], alpha[v, u]
         gate = max(config.gate_sigma / row[6], config.gate_floor_m)
 
-        def agrees(j: int, q: np.ndarray = q, n: np.ndarray = n, gate: float = gate, radius: float = row[7]) -> bool:
-            offset = old["positions_m"][:, j] - q
-            facing = n @ old["normals"][:, j] > config.min_cosine
+        def agrees(
+            surfels: dict[str, np.ndarray], j: int, q: np.ndarray = q, n: np.ndarray = n, gate: float = gate,
+            radius: float = row[7],
+        ) -> bool:  # fmt: skip
+            offset = surfels["positions_m"][:, j] - q
+            facing = n @ surfels["normals"][:, j] > config.min_cosine
             return abs(n @ offset) < gate and facing and np.linalg.norm(offset) < 4 * radius + gate
 
-        if i >= 0 and agrees(i):
+        if i >= 0 and agrees(old, i):
             w = old["confidences"][i]
             new["positions_m"][:, i] = (w * old["positions_m"][:, i] + weight * q) / (w + weight)
             new["colors"][:, i] = (w * old["colors"][:, i] + weight * color) / (w + weight)
@@ -111,22 +114,25 @@ def reference_fuse(
             new["confidences"][i] = min(w + weight, config.max_confidence)
             new["last_seen"][i] = frame_id
             continue
-        covered = False
-        for y in range(max(0, v - 1), min(camera.height, v + 2)):
-            for x in range(max(0, u - 1), min(camera.width, u + 2)):
-                j = index_map[y, x]
-                if j >= 0 and j != i:
-                    c = R.T @ (old["positions_m"][:, j] - t)
-                    away = np.hypot(camera.fx * c[0] / c[2] + camera.cx - u, camera.fy * c[1] / c[2] + camera.cy - v)
-                    covered |= away < config.spread_pixels and agrees(j)
-        if not covered:
-            values = (q, n, color, row[7], weight, frame_id, frame_id, 0)
-            for name, value in zip(ALL, values, strict=True):
-                appended[name].append(value)
+        unmatched.append((v, u, agrees))
         if i >= 0 and 0 < v < camera.height - 1 and 0 < u < camera.width - 1:
             depth = (R.T @ (old["positions_m"][:, i] - t))[2]
             if depth < surface[v - 1 : v + 2, u - 1 : u + 2, 2].min() - max(config.free_space_margin_m, 2 * gate):
                 new["confidences"][i] = max(old["confidences"][i] - weight, 0)
+    for v, u, agrees in unmatched:  # covered by what the others have become
+        row, i, color = surface[v, u], index_map[v, u], pyramid.frame.color[v, u].astype(float)
+        q, n, weight, covered = R @ row[:3] + t, R @ row[3:6], alpha[v, u], False
+        for y in range(max(0, v - 1), min(camera.height, v + 2)):
+            for x in range(max(0, u - 1), min(camera.width, u + 2)):
+                j = index_map[y, x]
+                if j >= 0 and j != i:
+                    c = R.T @ (new["positions_m"][:, j] - t)
+                    away = np.hypot(camera.fx * c[0] / c[2] + camera.cx - u, camera.fy * c[1] / c[2] + camera.cy - v)
+                    covered |= away < config.spread_pixels and agrees(new, j)
+        if not covered:
+            values = (q, n, color, row[7], weight, frame_id, frame_id, 0)
+            for name, value in zip(ALL, values, strict=True):
+                appended[name].append(value)
     return {
         name: np.concatenate([new[name], np.array(appended[name]).T.reshape(*new[name].shape[:-1], -1)], axis=-1)
         for name in ALL

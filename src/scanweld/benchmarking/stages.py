@@ -26,8 +26,8 @@ from scanweld.tracking.tracker import FrameToModelTracker
 STAGES = ("decode", "surfaces", "view", "track", "fuse", "loop", "other")
 """In the order of a frame's walk; other: motion model, moving things, health."""
 
-VIEWED_BYTES, FUSED_BYTES = 24, 48
-"""Of a surfel: position and normal; and colour, radius, confidence and when it was last seen."""
+VIEWED_BYTES, FUSED_BYTES = 32, 48
+"""Of a surfel: a pixel of the model image; and position to colour, radius, confidence and when it was last seen."""
 
 SETTLING_FRAMES = 5
 """Frames at the start that are not counted: caches fill, the map begins."""
@@ -81,7 +81,7 @@ class _TimedTracker(FrameToModelTracker):
         with self._clock.stage("track"):
             result = super().track(pyramid, view, *arguments, **options)
         surfaces = sum(level.surface.nbytes for level in pyramid.levels)
-        self._clock.bytes_moved["track"] += surfaces + _row_bytes(view) + _size(pyramid.grey)
+        self._clock.bytes_moved["track"] += surfaces + VIEWED_BYTES * len(view) + _size(pyramid.grey)
         return result
 
 
@@ -95,7 +95,8 @@ class _TimedMapper(SurfelMapper):
         with self._clock.stage("view"):
             seen = super().view(*arguments, **options)
         self._seen = len(seen)
-        self._clock.bytes_moved["view"] += len(self.map) * VIEWED_BYTES + _row_bytes(seen) + seen.index_map.nbytes
+        if seen is not self._fused:  # what fusion saw costs nothing more
+            self._clock.bytes_moved["view"] += self._seen * (FUSED_BYTES + VIEWED_BYTES) + seen.index_map.nbytes
         return seen
 
     def fuse(self, pyramid: SurfacePyramid, *arguments: Any, **options: Any) -> Any:
@@ -104,8 +105,9 @@ class _TimedMapper(SurfelMapper):
             counts = super().fuse(pyramid, *arguments, **options)
         level = pyramid.levels[0]
         frame = level.surface.nbytes + _size(pyramid.frame.color) + 4 * level.depth_m.size  # and the index map
-        # What is seen is read and written back, what is new is written.
-        self._clock.bytes_moved["fuse"] += frame + FUSED_BYTES * (2 * self._seen + max(0, len(self.map) - before))
+        # What is seen is read and written back, and shown in the model image; what is new is written.
+        new = max(0, len(self.map) - before)
+        self._clock.bytes_moved["fuse"] += frame + FUSED_BYTES * (2 * self._seen + new) + VIEWED_BYTES * self._seen
         return counts
 
 
@@ -187,7 +189,3 @@ def _cost(name: str, frames: list[_Clock], machine: Machine) -> StageCost:
 
 def _size(image: np.ndarray[Any, Any] | None) -> int:
     return 0 if image is None else int(image.nbytes)
-
-
-def _row_bytes(view: ModelView) -> int:
-    return sum(_size(rows) for rows in (view.positions_m, view.normals, view.confidences, view.intensities))

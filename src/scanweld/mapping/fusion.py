@@ -13,7 +13,7 @@ from scanweld.geometry.camera import PinholeCamera
 from scanweld.geometry.depth import SurfacePyramid, as_kernel_input, intrinsics_array
 from scanweld.mapping import kernels
 from scanweld.mapping.merging import MergingConfig
-from scanweld.mapping.rendering import DepthBuffers, SurfelView, render_model_view
+from scanweld.mapping.rendering import DepthBuffers, SurfelView, render_index_map, shade
 from scanweld.mapping.surfel_map import SurfelMap
 from scanweld.parallel import run_ranges
 
@@ -85,11 +85,10 @@ def fuse(
     T_world_camera: Float64,
     frame_id: int,
     config: FusionConfig,
-    view: SurfelView | None = None,
     moving: Bool | None = None,
     depth_buffers: DepthBuffers | None = None,
-) -> FusionCounts:
-    """Merge a frame into the map, in place; `view` is the map seen from this pose, where it is known already.
+) -> tuple[FusionCounts, SurfelView]:
+    """Merge a frame into the map, in place; returns what happened, and the map as it was seen, without what is new.
 
     Pixels in `moving` (H, W) add nothing to the map, and surfels that they lie on are demoted to the confidence of one
     measurement (Keller et al. 2013, sec. 6).
@@ -108,17 +107,16 @@ def fuse(
         config.gate_sigma, config.gate_floor_m, config.min_cosine, config.free_space_margin_m, config.spread_pixels,
         config.max_confidence,
     ], np.float32)  # fmt: skip
-    if view is None:
-        view = render_model_view(surfels, candidates, T_world_camera, camera, config.stable_confidence, depth_buffers)
-    seen, image, pages = view.seen, view.image, surfels.pages
+    seen = render_index_map(surfels, candidates, T_world_camera, camera, config.stable_confidence, depth_buffers)
+    pages = surfels.pages
     merged = np.zeros(camera.width * camera.height + 1, np.uint8)
     pending, counts = np.empty(camera.shape, np.int32), np.empty(camera.height, np.int32)
 
     def merge(start: int, stop: int) -> None:
         kernels.merge_pages(
-            start, stop, seen.slots, pages.counts, seen.landed, surface.reshape(-1), color.reshape(-1),
-            weights.reshape(-1), transform, parameters, camera.width, camera.height, frame_id, pages.pool, pages.whole,
-            pages.dirty, merged,
+            start, stop, seen.slots, pages.counts, seen.landed, seen.numbers.reshape(-1), surface.reshape(-1),
+            color.reshape(-1), weights.reshape(-1), transform, parameters, camera.width, camera.height, frame_id,
+            pages.pool, pages.whole, pages.dirty, merged,
         )  # fmt: skip
 
     def cover(start: int, stop: int) -> None:
@@ -128,6 +126,7 @@ def fuse(
         )  # fmt: skip
 
     run_ranges(len(seen.slots), merge)
+    image = shade(surfels, seen)  # a neighbour covers a pixel from where it has come to
     run_ranges(camera.height, cover)
     offsets = np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
     new, anchor = int(offsets[-1]), surfels.anchor
@@ -141,7 +140,8 @@ def fuse(
 
     run_ranges(camera.height, make)
     pages.add(rows)
-    return FusionCounts(new, tidy(surfels, frame_id, config))
+    counted = FusionCounts(new, tidy(surfels, frame_id, config))
+    return counted, SurfelView(T_world_camera, camera, seen, image, config.stable_confidence)
 
 
 def tidy(surfels: SurfelMap, frame_id: int, config: FusionConfig) -> int:

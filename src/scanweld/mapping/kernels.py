@@ -207,7 +207,7 @@ def is_seen_through(u, v, x, y, z, gate, margin, surface, width, height, transfo
 
 @kernel
 def merge_pages(
-    start, stop, slots, counts, landed, surface, color, alpha, transform, parameters, width, height,
+    start, stop, slots, counts, landed, index_map, surface, color, alpha, transform, parameters, width, height,
     frame_id, pool, whole, dirty, merged,
 ):  # fmt: skip
     """Merge the surfels of pages slots[start:stop] with the pixels that they won: p <- (w p + alpha q) / (w + alpha).
@@ -215,21 +215,24 @@ def merge_pages(
     The same for normal and colour (Keller et al. 2013, eq. 5-8). A surfel that is seen through loses the weight of the
     pixel, one that a pixel of negative weight, which moves, lies on all but that of one measurement.
 
-    landed: see `shade_pages`; surface (H * W * 8,), see `SurfaceLevel.surface`; color (H * W * 3,) uint8; alpha
-    (H * W,) float32 weight of the measurement; transform (3, 4) camera -> world; parameters: see `fusion.fuse`; dirty
-    (P,) uint8: pages with a surfel that lost confidence; merged (H * W + 1,) uint8: pixels whose measurement is in the
-    map; the last is written in vain.
+    landed, index_map: see `shade_pages`; surface (H * W * 8,), see `SurfaceLevel.surface`; color (H * W * 3,) uint8;
+    alpha (H * W,) float32 weight of the measurement; transform (3, 4) camera -> world; parameters: see `fusion.fuse`;
+    dirty (P,) uint8: pages with a surfel that lost confidence; merged (H * W + 1,) uint8: pixels whose measurement is
+    in the map; the last is written in vain.
     """
     one, zero, margin = np.float32(1), np.float32(0), parameters[3]
     seen, rows = np.zeros(8 * PAGE, np.float32), np.zeros(4 * STRIDE, np.float32)
     verdicts, winners = np.empty(PAGE, np.int32), np.empty(PAGE, np.int32)
     for s in range(start, stop):
         slot, first, count = np.uint64(slots[s]), np.uint64(s) * np.uint64(PAGE), np.uint64(counts[slots[s]])
-        base = slot * np.uint64(SPAN)
+        base, number = slot * np.uint64(SPAN), np.int32(slots[s]) * np.int32(PAGE)
         won = np.uint64(0)
         for k in range(count):  # no branch: which surfels won a pixel is hard to predict
+            pixel = landed[first + k]
             winners[won] = np.int32(k)
-            won += np.uint64(landed[first + k] >= 0)
+            wins = (pixel >= 0) & (index_map[np.uint64(max(pixel, np.int32(0)))] == number + np.int32(k))
+            landed[first + k] = pixel if wins else np.int32(-1)
+            won += np.uint64(wins)
         # What the pixels say, into rows: a loop so short that the processor waits for many pixels at once.
         for n in range(won):
             place = np.uint64(winners[n])

@@ -4,43 +4,40 @@ from __future__ import annotations
 
 import numpy as np
 
-from scanweld.arrays import Bool, Float32, Float64, Int32
+from scanweld.arrays import Bool, Float32, Float64
 from scanweld.geometry import se3
 from scanweld.geometry.camera import PinholeCamera
 from scanweld.geometry.depth import SurfacePyramid
 from scanweld.geometry.views import MapCorrection, ModelView
 from scanweld.mapping.fusion import FusionConfig, FusionCounts, fuse
 from scanweld.mapping.merging import merge_doubled
-from scanweld.mapping.rendering import VIEW_MARGIN_PIXELS, DepthBuffers, SurfelView, find_candidates, render_model_view
+from scanweld.mapping.rendering import DepthBuffers, SurfelView, find_candidates, render_model_view
 from scanweld.mapping.surfel_map import SurfelMap
 
 
 class SurfelMapper:
     """Point-based fusion into a :class:`SurfelMap`.
 
-    `view` remembers which surfels were near the view, so that `fuse` at a pose close by need not look at the whole
-    map again.
+    Fusion looks at the map from the frame's pose anyway; what it saw is the view for the next frame, if that is
+    expected close by.
     """
 
     def __init__(self, config: FusionConfig | None = None) -> None:
         self.config = config or FusionConfig()
         self.map = SurfelMap()
         self._frames_fused = 0
-        self._candidates: Int32 | None = None
         self._depth_buffers = DepthBuffers()
-        self._view: SurfelView | None = None
+        self._fused: SurfelView | None = None
         self._reach_m = REACH_M
-        self._viewed_from: tuple[Float64, PinholeCamera] | None = None
 
     def view(self, T_world_camera: Float64, camera: PinholeCamera) -> ModelView:
-        """Return the map as a camera at `T_world_camera` sees it."""
-        self._candidates = find_candidates(self.map, T_world_camera, camera, far_m=self._reach_m)
-        self._viewed_from = T_world_camera, camera
-        seen = render_model_view(
-            self.map, self._candidates, T_world_camera, camera, self.config.stable_confidence, self._depth_buffers
+        """Return the map as a camera at `T_world_camera`, or within a few pixels of there, sees it."""
+        if self._fused is not None and _moved_share(self._fused, T_world_camera, camera) < SAME_VIEW_SHARE:
+            return self._fused
+        candidates = find_candidates(self.map, T_world_camera, camera, far_m=self._reach_m)
+        return render_model_view(
+            self.map, candidates, T_world_camera, camera, self.config.stable_confidence, self._depth_buffers
         )
-        self._view = seen
-        return seen
 
     def fuse(
         self, pyramid: SurfacePyramid, T_world_camera: Float64, *, keyframe: int = 0, moving: Bool | None = None
@@ -50,18 +47,14 @@ class SurfelMapper:
         New surfels move with `keyframe`.
         """
         self.map.anchor = keyframe
-        self._reach_m = max(self._reach_m, FURTHER * float(pyramid.levels[0].depth_m.max(initial=0.0)))
-        camera, candidates, view = pyramid.levels[0].camera, self._candidates, None
-        if candidates is None or self._moved_pixels(T_world_camera, camera, NEAREST_M) > VIEW_MARGIN_PIXELS:
-            candidates = find_candidates(self.map, T_world_camera, camera, far_m=self._reach_m)
-        elif self._moved_pixels(T_world_camera, camera, TYPICAL_M) < SAME_VIEW_PIXELS:
-            view = self._view
-        counts = fuse(
-            self.map, candidates, pyramid, T_world_camera, self._frames_fused, self.config, view, moving,
-            self._depth_buffers,
-        )  # fmt: skip
+        level = pyramid.levels[0]
+        self._reach_m = max(self._reach_m, FURTHER * float(level.depth_m.max(initial=0.0)))
+        candidates = find_candidates(self.map, T_world_camera, level.camera, far_m=self._reach_m)
+        counts, seen = fuse(
+            self.map, candidates, pyramid, T_world_camera, self._frames_fused, self.config, moving, self._depth_buffers
+        )
         self._frames_fused += 1
-        self._candidates = self._view = None
+        self._fused = seen if counts.appended < MOSTLY_NEW * len(seen) else None
         return counts
 
     def apply(self, correction: MapCorrection) -> None:
@@ -85,16 +78,17 @@ class SurfelMapper:
 
     def _merge(self, moved_m: Float32) -> None:
         merge_doubled(self.map, moved_m, self.config.max_confidence, self.config.merging)
-        self._candidates = self._view = None
+        self._fused = None
 
-    def _moved_pixels(self, T_world_camera: Float64, camera: PinholeCamera, depth_m: float) -> float:
-        """How far the image has moved since the last view, at most, where surfaces are no nearer than `depth_m`."""
-        if self._viewed_from is None or self._viewed_from[1] != camera:
-            return np.inf
-        motion = se3.inverse(self._viewed_from[0]) @ T_world_camera
-        shift, turn = float(np.linalg.norm(motion[:3, 3])), float(se3.rotation_angle_rad(motion))
-        # At the corners of the image a turn moves pixels by half as much again as in the middle.
-        return max(camera.fx, camera.fy) * (1.5 * turn + shift / depth_m)
+
+def _moved_share(view: ModelView, T_world_camera: Float64, camera: PinholeCamera) -> float:
+    """How far the image has moved since a view, as a share of its width, where surfaces are not nearer than usual."""
+    if view.camera != camera:
+        return np.inf
+    motion = se3.inverse(view.T_world_camera) @ T_world_camera
+    shift, turn = float(np.linalg.norm(motion[:3, 3])), float(se3.rotation_angle_rad(motion))
+    # At the corners of the image a turn moves pixels by half as much again as in the middle.
+    return max(camera.fx, camera.fy) * (1.5 * turn + shift / TYPICAL_M) / camera.width
 
 
 def _moved(surfels: SurfelMap, correction: MapCorrection) -> Float32:
@@ -107,8 +101,11 @@ def _moved(surfels: SurfelMap, correction: MapCorrection) -> Float32:
 REACH_M, FURTHER = 12.0, 1.5
 """Surfels are looked at as far as this, and this much further than anything was measured so far."""
 
-NEAREST_M, TYPICAL_M = 0.3, 1.0
-"""Surfaces are not expected to be nearer than the first, and mostly beyond the second."""
+TYPICAL_M = 1.0
+"""Surfaces are mostly beyond this."""
 
-SAME_VIEW_PIXELS = 0.5
-"""A surfel that moved less than this since the prediction stays in the pixel where it was seen."""
+SAME_VIEW_SHARE = 0.05
+"""A view that moved by less than this share of the image shows nearly the same of the map."""
+
+MOSTLY_NEW = 0.05
+"""Where so many surfels were added, as a share of those seen, the map has to be looked at again."""

@@ -163,7 +163,7 @@ def _choose_frames(folder: Path, sequence: RgbdSequence, frames: str | None, con
         raise InvalidInputError(f"{folder}: there are no frames {what} that the sequence has")
     looked_at = _look_at(sequence, posed.rows[np.linspace(0, len(posed.rows) - 1, LOOKED_AT).astype(int)])
     farthest = config.surfaces.max_depth_m
-    voxel_m = config.voxel_m or voxel_for(looked_at, farthest)
+    voxel_m = config.voxel_m or voxel_for(looked_at, config.surfaces)
     if frames is None:
         posed = posed.select(frames_with_news(posed.T_world_camera, median_depth_m(looked_at, farthest)))
     return _Chosen(posed, voxel_m)

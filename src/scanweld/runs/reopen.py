@@ -9,9 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from scanweld.arrays import Bool, Float64, Int64
+from scanweld.config import from_mapping
 from scanweld.datasets.base import RgbdSequence, WrappedSequence
 from scanweld.datasets.intrinsics import parse_intrinsics
 from scanweld.datasets.open import open_sequence
+from scanweld.datasets.synthetic import RenderConfig, SyntheticSequence
 from scanweld.errors import DatasetError, FileFormatError
 from scanweld.geometry.camera import PinholeCamera
 from scanweld.geometry.frame import Frame
@@ -104,7 +106,11 @@ def reopen_sequence(run: Mapping[str, Any]) -> RgbdSequence:
     ------
     DatasetError
         When the sequence is not there any more, or is another one by now.
+    FileFormatError
+        When what run.json says of a calibration is not readable.
     """
+    if isinstance(run.get("render"), Mapping):  # a demo renders its sequence, and keeps what it rendered
+        return SyntheticSequence(from_mapping(RenderConfig, run["render"], MARK))
     place = Path(str(run.get("input") or ""))
     if not run.get("input") or not place.exists():
         raise DatasetError(f"the sequence of the run is not there any more: {run.get('input') or 'it has no path'}")
@@ -120,6 +126,9 @@ def reopen_sequence(run: Mapping[str, Any]) -> RgbdSequence:
     )
     found = run.get("refinements")
     if run.get("calibrate") and found:
-        camera = PinholeCamera(**found[0]["intrinsics"])
-        return CalibratedSequence(sequence, camera, DepthCorrection(found[0]["inverse_depth_offset_per_m"]))
+        try:
+            camera, offset = PinholeCamera(**found[0]["intrinsics"]), float(found[0]["inverse_depth_offset_per_m"])
+        except (KeyError, TypeError, ValueError) as error:
+            raise FileFormatError(f"{MARK}: the calibration of the run is not readable: {error}") from None
+        return CalibratedSequence(sequence, camera, DepthCorrection(offset))
     return sequence
