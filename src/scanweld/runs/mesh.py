@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from scanweld.arrays import Array, Int64
+from scanweld.arrays import Array, Int64, finite_rows
 from scanweld.datasets.base import RgbdSequence
 from scanweld.datasets.selection import parse_frames
 from scanweld.datasets.stream import stream
@@ -215,6 +215,8 @@ def _fuse_surfels(path: Path, config: MeshConfig) -> TsdfVolume:
     if missing:
         raise FileFormatError(f"{path}: is no map of a run, it has no {', '.join(missing)}")
     kept = (surfels["confidence"] >= _least_confidence(surfels)) & (surfels["radius"] > 0)
+    kept &= finite_rows(*(surfels[name] for name in SURFEL_COLUMNS))
+    kept &= (surfels["nx"] != 0) | (surfels["ny"] != 0) | (surfels["nz"] != 0)
     if not kept.any():
         raise InvalidInputError(f"{path}: the map is empty")
     surfels = {name: values[kept] for name, values in surfels.items()}
