@@ -39,9 +39,11 @@ if TYPE_CHECKING:
     from scanweld.geometry.depth import SurfaceConfig, SurfacePyramid, build_pyramid
     from scanweld.geometry.foreign import as_cloud
     from scanweld.geometry.frame import Frame
+    from scanweld.geometry.mesh import TriangleMesh
     from scanweld.geometry.normals import estimate_normals
     from scanweld.geometry.point_cloud import PointCloud, voxel_downsample
     from scanweld.geometry.views import MapCorrection, ModelView
+    from scanweld.io.mesh_files import write_mesh
     from scanweld.io.ply import read_ply, write_ply
     from scanweld.io.point_files import read_points, write_points
     from scanweld.io.trajectory_files import read_trajectory, write_tum
@@ -51,6 +53,9 @@ if TYPE_CHECKING:
     from scanweld.mapping.merging import MergingConfig
     from scanweld.mapping.rendering import render_picture
     from scanweld.mapping.surfel_map import SurfelMap
+    from scanweld.meshing.config import MeshConfig
+    from scanweld.meshing.fuse import mesh_from_frames
+    from scanweld.meshing.rendering import render_mesh
     from scanweld.parallel import set_num_threads
     from scanweld.refinement.calibration import DepthCorrection
     from scanweld.refinement.config import RefinementConfig
@@ -71,6 +76,7 @@ if TYPE_CHECKING:
     from scanweld.registration.result import RegistrationResult, Status
     from scanweld.registration.robust_pairs import RobustAlignment, align_pairs_robustly
     from scanweld.registration.uncertainty import point_covariances
+    from scanweld.runs.mesh import mesh_run
     from scanweld.runs.run import RunSummary, run_sequence
     from scanweld.slam.health import HealthConfig
     from scanweld.slam.submaps import SubmapConfig
@@ -139,6 +145,12 @@ _HOME = {
     "refinement.config": ("RefinementConfig",),
     "refinement.refine": ("Refinement", "RefinementStatus", "refine_keyframes"),
     "slam.submaps": ("SubmapConfig",),
+    "geometry.mesh": ("TriangleMesh",),
+    "io.mesh_files": ("write_mesh",),
+    "runs.mesh": ("mesh_run",),
+    "meshing.fuse": ("mesh_from_frames",),
+    "meshing.config": ("MeshConfig",),
+    "meshing.rendering": ("render_mesh",),
     "trajectory": ("FrameResult", "FrameState", "Trajectory"),
 }  # fmt: skip
 _MODULE_OF = {name: module for module, names in _HOME.items() for name in names}
@@ -166,6 +178,7 @@ __all__ = [
     "ManyResult",
     "MapCorrection",
     "MergingConfig",
+    "MeshConfig",
     "MissingDependencyError",
     "ModelView",
     "MotionPrior",
@@ -199,6 +212,7 @@ __all__ = [
     "SyntheticSequence",
     "TrackingConfig",
     "Trajectory",
+    "TriangleMesh",
     "TwoFrameConfig",
     "UnreadableFrameError",
     "align_closed_form",
@@ -218,6 +232,8 @@ __all__ = [
     "explain_icp",
     "from_mapping",
     "icp",
+    "mesh_from_frames",
+    "mesh_run",
     "open_sequence",
     "pair_residuals",
     "point_covariances",
@@ -227,6 +243,7 @@ __all__ = [
     "refine_keyframes",
     "register_global",
     "register_many",
+    "render_mesh",
     "render_picture",
     "render_sequence",
     "rpe",
@@ -238,6 +255,7 @@ __all__ = [
     "surface_completeness",
     "to_toml",
     "voxel_downsample",
+    "write_mesh",
     "write_ply",
     "write_points",
     "write_tum",

@@ -1,0 +1,76 @@
+"""`scanweld mesh`: the surface of a run as triangles, or as splats."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+Option = typer.Option
+
+
+def mesh(
+    run: Annotated[Path, typer.Argument(help="Run folder, as slam wrote it.", metavar="RUN")],
+    out: Annotated[
+        Path | None, Option(help="File to write: .ply, .obj or .glb. Default: RUN/mesh.ply.", metavar="FILE")
+    ] = None,
+    voxel: Annotated[
+        float, Option(help="Spacing of the grid [m]. Default: by pixels and noise at the usual depth.", min=0.0)
+    ] = 0.0,
+    frames: Annotated[
+        str | None, Option(help="Fuse these frames. Default: all that show something new.", metavar="A:B[:STEP]")
+    ] = None,
+    depth_max: Annotated[float | None, Option(help="Leave out depth beyond this [m].", min=0.1)] = None,
+    fill_holes: Annotated[float, Option(help="Close holes with a border up to this long [m].", min=0.0)] = 0.0,
+    from_surfels: Annotated[
+        bool, Option("--from-surfels", help="Mesh the surfels of map.ply, without the sequence.")
+    ] = False,
+    splat: Annotated[bool, Option("--splat", help="Write Gaussian splats instead. Default: RUN/splats.ply.")] = False,
+    memory: Annotated[float | None, Option(help="Memory that the grid may take [MB].", min=1.0)] = None,
+    threads: Annotated[int | None, Option(help="Number of threads. Default: all cores.", min=1)] = None,
+    json_output: Annotated[bool, Option("--json", help="Print the figures as one JSON object.")] = False,
+) -> int:
+    """Make a coloured triangle mesh of a run: its depth is fused again, at the poses that came out in the end.
+
+    Holes are left where nothing was seen. Where the sequence is not there any more, the mesh is made of the surfels
+    in map.ply. --splat writes the surfels as a file that viewers of Gaussian splats open.
+    """
+    from scanweld.runs.mesh import mesh_run, write_splats
+
+    if splat:
+        path, count = write_splats(run, out=out)
+        typer.echo(json.dumps({"path": str(path), "splats": count}) if json_output else f"written  {path}")
+        return 0
+    from scanweld.cli.progress import RenderProgress
+    from scanweld.meshing.config import MeshConfig
+    from scanweld.parallel import kernels_are_cached, set_num_threads
+
+    if threads is not None:
+        set_num_threads(threads)
+    config = MeshConfig(voxel_m=voxel, fill_holes_m=fill_holes)
+    if depth_max is not None:
+        config = replace(config, surfaces=replace(config.surfaces, max_depth_m=depth_max))
+    if memory is not None:
+        config = replace(config, max_memory_mb=memory)
+    if not kernels_are_cached("mesh"):
+        print("compiling, once for this machine", file=sys.stderr, flush=True)
+    with RenderProgress("mesh") as progress:
+        made = mesh_run(run, out=out, config=config, frames=frames, from_surfels=from_surfels, progress=progress.update)
+    kernels_are_cached("mesh", now=True)
+    if json_output:
+        figures = {
+            "path": str(made.path), "triangles": len(made.mesh), "vertices": len(made.mesh.vertices_m),
+            "area_m2": made.mesh.area_m2, "voxel_m": made.voxel_m, "frames": made.num_frames,
+            "grid_mb": made.memory_mb, "seconds": made.seconds,
+        }  # fmt: skip
+        typer.echo(json.dumps(figures))
+        return 0
+    source = f"{made.num_frames} frames" if made.num_frames else "surfels"
+    typer.echo(f"mesh     {len(made.mesh):,} triangles, {made.mesh.area_m2:.1f} m2")
+    typer.echo(f"from     {source}, voxel {made.voxel_m * 1e3:g} mm, {made.memory_mb:.0f} MB, {made.seconds:.1f} s")
+    typer.echo(f"written  {made.path}")
+    return 0
