@@ -23,6 +23,8 @@ OPTIONS = {
     "mesh": "--out --voxel --frames --depth-max --fill-holes --from-surfels --splat --memory --threads --json",
     "bench": "--frames --sizes --peer-python --plot --threads --json",
     "warmup": "--json",
+    "config": "--set",
+    "datasets": "--format",
 }
 """What every command must offer."""
 

@@ -16,6 +16,8 @@ from typing import Annotated, Any
 import typer
 
 from scanweld.cli.bench import bench
+from scanweld.cli.config import config
+from scanweld.cli.datasets import datasets
 from scanweld.cli.demo import demo
 from scanweld.cli.evaluate import evaluate
 from scanweld.cli.mesh import mesh
@@ -53,7 +55,7 @@ def _stoppable(command: Callable[..., int]) -> Callable[..., int]:
     return call
 
 
-for command in (demo, slam, register, evaluate, render, report, mesh, bench, warmup):
+for command in (demo, slam, register, evaluate, render, report, mesh, config, datasets, bench, warmup):
     app.command()(_stoppable(command))
 
 
