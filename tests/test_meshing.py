@@ -454,12 +454,12 @@ def test_a_sequence_is_opened_as_it_was_for_the_run(finished_run: Path) -> None:
     intrinsics = {"fx": 130.0, "fy": 130.0, "cx": 80.0, "cy": 60.0, "width": 160, "height": 120}
     found = {"intrinsics": intrinsics, "inverse_depth_offset_per_m": 0.1}
     plain = reopen_sequence({**run, "frames": "2:6"}).read(0)
-    frame = reopen_sequence({**run, "frames": "2:6", "calibrate": True, "refinements": [found]}).read(0)
+    frame = reopen_sequence({**run, "frames": "2:6", "calibrated": True, "refinements": [found]}).read(0)
     assert frame.camera == sw.PinholeCamera(**intrinsics)
     valid = plain.depth_m > 0
     assert 1 / frame.depth_m[valid] == pytest.approx(1 / plain.depth_m[valid] + 0.1, rel=1e-5)
     with pytest.raises(FileFormatError, match="calibration of the run is not readable"):
-        reopen_sequence({**run, "calibrate": True, "refinements": [{}]})
+        reopen_sequence({**run, "calibrated": True, "refinements": [{}]})
 
 
 def test_a_folder_that_is_no_run(tmp_path: Path) -> None:

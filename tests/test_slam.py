@@ -447,3 +447,50 @@ class TestTrajectoryOfResults:
         assert len(trajectory_of(self.results(LOST, LOST))) == 2
         assert len(trajectory_of(self.results(LOST, LOST), tracked_only=True)) == 0
         assert len(trajectory_of([])) == 0
+
+
+class TestGapsBeforeAWall:
+    """What is free before a wall must not drown what is seen, however the frames are spaced."""
+
+    def drift(self, times: list[float], skipped: int = 0) -> float:
+        """How far a still camera before a blank wall with 2 mm of noise is off in the end [m]."""
+        camera = sw.PinholeCamera(130, 130, 79.5, 59.5, 160, 120)
+        rng = np.random.default_rng(5)
+        slam = sw.build_slam(camera, sw.SlamConfig(loop_closer="none"))
+        for k, time_s in enumerate(times):
+            if 12 <= k < 12 + skipped:
+                slam.skip(time_s, "damaged")
+                continue
+            depth = (1.4 + 0.002 * rng.standard_normal(camera.shape)).astype(np.float32)
+            slam.process(sw.Frame(time_s, depth, None, camera))
+        return float(np.linalg.norm(slam.results[-1].T_world_camera[:3, 3]))
+
+    @pytest.mark.parametrize("gap_s", [0.033, 2.0, 60.0, 1e5])
+    def test_a_pause(self, gap_s: float) -> None:
+        times = [0.033 * k for k in range(15)]
+        assert self.drift([*times, *(times[-1] + gap_s + 0.033 * k for k in range(12))]) < 0.02
+
+    def test_frames_that_cannot_be_read(self) -> None:
+        assert self.drift([0.033 * k for k in range(12 + 200 + 12)], skipped=200) < 0.02
+
+    def test_stamps_that_nearly_agree(self) -> None:
+        assert self.drift([0.033 * k - (0.0325 if k % 3 == 2 else 0) for k in range(30)]) < 0.02
+
+
+def test_a_camera_that_was_carried_is_expected_to_stand_still() -> None:
+    model = ConstantVelocity()
+    for k in range(5):
+        model.observe(0.1 * k, se3.exp([0.1 * k, 0, 0, 0, 0, 0]))
+    model.forget()
+    model.observe(0.5, se3.exp([9, 0, 0, 0, 0, 0]))
+    np.testing.assert_allclose(model.predict(0.6), se3.exp([9, 0, 0, 0, 0, 0]), atol=1e-9)
+
+
+def test_a_mask_of_what_moved_is_not_carried_over_to_images_of_another_size() -> None:
+    """Something moves before a small camera; the next frame is of a larger one."""
+    slam = sw.build_slam(CAMERA, sw.SlamConfig(loop_closer="none"))
+    sequence = rendered(count=40)
+    for frame in sequence.frames[:3]:
+        slam.process(frame)
+    slam._moving = np.ones((30, 40), np.bool_)
+    assert slam.process(sequence.frames[3]).state is sw.FrameState.TRACKING

@@ -185,3 +185,19 @@ def test_colors_are_rounded_not_cut() -> None:
     one["colors"] = np.array([[254.6, -0.4, 300.0]] * 3, np.float32)
     stored.append(*one.values(), 0)
     np.testing.assert_array_equal(stored.colors[0], [255, 0, 255])
+
+
+def test_removing_from_nearly_empty_pages_of_one_cell() -> None:
+    """What is left of the first page goes to the second one, from which something is removed, too."""
+    surfels = sw.SurfelMap()
+    positions = np.random.default_rng(2).uniform(0.01, 0.2, (3, 300)).astype(np.float32)
+    normals = np.tile(np.array([[0], [0], [1]], np.float32), 300)
+    grey, ones = np.full((3, 300), 9, np.float32), np.ones(300, np.float32)
+    surfels.append(positions, normals, grey, 0.01 * ones, ones, 0)
+    doomed = np.zeros(300, np.bool_)
+    doomed[:230] = doomed[-1] = True
+    expected = surfels.positions_m[:, ~doomed]
+    assert surfels.remove(doomed) == 231
+    assert len(surfels) == 69
+    order = np.lexsort(surfels.positions_m)
+    np.testing.assert_array_equal(surfels.positions_m[:, order], expected[:, np.lexsort(expected)])

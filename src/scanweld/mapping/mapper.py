@@ -72,6 +72,7 @@ class SurfelMapper:
         moved = _moved(other.map, correction)
         places = self.map.take_in(other.map)
         self._frames_fused = max(self._frames_fused, other._frames_fused)
+        self._reach_m = max(self._reach_m, other._reach_m)
         moved_m = np.zeros((3, len(self.map)), np.float32)
         moved_m[:, places] = moved
         self._merge(moved_m)

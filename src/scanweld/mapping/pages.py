@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from scanweld.arrays import Float32, Float64, Int32, Int64, UInt8
@@ -90,13 +92,16 @@ class PagePool:
         self._free[self._num_free] = slot
         self._num_free += 1
 
-    def shrink(self, slot: int, rows: Float32) -> None:
-        """Let a page hold `rows` (ROWS, count), not more than before; a nearly empty one is given up."""
-        few = rows.shape[1] < PAGE // 4
-        self.counts[slot] = rows.shape[1]
-        self.page(slot)[:] = rows
-        if few:
-            self.release(slot)
+    def shrink(self, pages: Sequence[tuple[int, Float32]]) -> None:
+        """Let pages hold `rows` (ROWS, count) each, not more than before; nearly empty ones are given up."""
+        homeless = []
+        for slot, rows in pages:
+            self.counts[slot] = rows.shape[1]
+            self.page(slot)[:] = rows
+            if rows.shape[1] < PAGE // 4:
+                self.release(slot)
+                homeless.append(rows)
+        for rows in homeless:  # only now: they may come into a page that was shrunk, too
             self.add(rows)
 
     def inside(self, planes: Float64) -> Int32:

@@ -138,12 +138,13 @@ class SurfelMap:
         """Drop the surfels where `doomed` (N,) is true; returns how many went."""
         if doomed.shape != (len(self),):
             raise InvalidInputError(f"map: expected a mask of shape ({len(self)},), got {doomed.shape}")
-        last, live = 0, self.pages.live.tolist()
+        last, live, shrunk = 0, self.pages.live.tolist(), []
         for slot, count in zip(live, self.pages.counts[live].tolist(), strict=True):
             kept = ~doomed[last : last + count]
             last += count
             if not kept.all():
-                self.pages.shrink(slot, self.pages.page(slot)[:, kept])
+                shrunk.append((slot, self.pages.page(slot)[:, kept]))
+        self.pages.shrink(shrunk)
         return int(np.count_nonzero(doomed))
 
     def clean(self, slots: Int64, frame_id: int, unstable_frames: int, stable_confidence: float) -> int:
@@ -160,7 +161,7 @@ class SurfelMap:
         pages.dirty[slots] = 0
         after = pages.counts[slots]
         for slot in slots[(after < before) & (after < PAGE // 4)].tolist():
-            pages.shrink(slot, pages.page(slot).copy())
+            pages.shrink([(slot, pages.page(slot).copy())])
         return int((before - after).sum())
 
     def pages_in(self, planes: Float64) -> Int32:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 from scanweld.arrays import Float64
 from scanweld.datasets.base import RgbdSequence, readable_frames
+from scanweld.datasets.gyroscope import Gyroscope, gyroscope_of
 from scanweld.geometry.camera import PinholeCamera
 from scanweld.geometry.frame import Frame
 from scanweld.refinement.calibration import DepthCorrection
@@ -40,6 +41,11 @@ class CalibratedSequence:
     def timestamps_s(self) -> Float64:
         """Time of every frame (N,) [s]."""
         return self.base.timestamps_s
+
+    @property
+    def gyroscope(self) -> Gyroscope | None:
+        """Readings of a gyroscope, where there is one."""
+        return gyroscope_of(self.base)
 
     def __len__(self) -> int:
         return len(self.base)

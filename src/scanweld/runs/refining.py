@@ -21,7 +21,7 @@ def calibrate(slam: Slam, sequence: RgbdSequence, config: RefinementConfig) -> t
     """
     if not (config.calibrate_intrinsics or config.calibrate_depth):
         config = replace(config, calibrate_intrinsics=True, calibrate_depth=True)
-    found = slam.refine(sequence.camera, config)
+    found = slam.refine(sequence.camera, config, apply=False)
     return (CalibratedSequence(sequence, found.camera, found.depth) if found.recalibrated else sequence), found
 
 

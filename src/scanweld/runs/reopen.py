@@ -125,7 +125,7 @@ def reopen_sequence(run: Mapping[str, Any]) -> RgbdSequence:
         **options,
     )
     found = run.get("refinements")
-    if run.get("calibrate") and found:
+    if run.get("calibrated") and found:
         try:
             camera, offset = PinholeCamera(**found[0]["intrinsics"]), float(found[0]["inverse_depth_offset_per_m"])
         except (KeyError, TypeError, ValueError) as error:

@@ -22,6 +22,7 @@ from scanweld.errors import DatasetError, InvalidInputError
 from scanweld.evaluation.surface_metrics import compression_ratio
 from scanweld.evaluation.trajectory_metrics import AteResult, ate, rpe
 from scanweld.refinement.refine import Refinement
+from scanweld.runs.calibrated import CalibratedSequence
 from scanweld.runs.folder import check_writable, write_folder
 from scanweld.runs.output import write_run
 from scanweld.runs.refining import calibrate as calibrate_camera
@@ -164,6 +165,7 @@ def run_sequence(
                     **(description or {}),
                     "warnings": [*(description or {}).get("warnings", ()), *tally.warnings],
                     "interrupted": interrupted,
+                    **({"calibrated": isinstance(sequence, CalibratedSequence)} if calibrate else {}),
                     **({"refinements": described(refinements)} if refinements else {}),
                 },
                 started=started,

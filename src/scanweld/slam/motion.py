@@ -32,6 +32,13 @@ within 0.5 ms would be carried on a hundredfold.
 FASTEST = 3.0
 """Standard deviation [m/s, rad/s] of the velocity of a camera of which nothing is known."""
 
+FARTHEST_OFF = 0.5
+"""Standard deviation [m, rad] of a predicted pose at most."""
+
+SHORTEST_S = 0.02
+"""Two frames are counted as at least so far apart: between stamps that are nearly equal nothing could change, and what
+is seen would be taken for known already."""
+
 STEADIEST = 0.02
 """The velocity of a camera that has stood still changes by so much [m/s, rad/s] in a second: it will be taken up."""
 
@@ -56,7 +63,8 @@ class ConstantVelocity:
         self._seen_for_s = 0.0  # how long that motion was
         self._measured: tuple[float, Float64] | None = None  # when and where the camera was last seen
         self._in_full = False  # whether the last frame was measured, and left nothing free
-        self._weighed: tuple[Float64, Float64] | None = None  # change of the state, and its covariance afterwards
+        # A weighed pose, the change of the state that it is, and the covariance afterwards.
+        self._weighed: tuple[Float64, Float64, Float64] | None = None
 
     def predict(self, timestamp_s: float) -> Float64:
         """Return T_world_camera (4, 4) at a time."""
@@ -64,15 +72,19 @@ class ConstantVelocity:
             return self._filtered(timestamp_s)
         return np.asarray(self._measured[1] @ se3.exp(self._seen_velocity * self._ahead_s(timestamp_s)))
 
-    def weigh(self, timestamp_s: float, aligned: RegistrationResult) -> RegistrationResult:
+    def weigh(
+        self, timestamp_s: float, aligned: RegistrationResult, rotation: Float64 | None = None
+    ) -> RegistrationResult:
         """Complete an alignment by what the motion knows better: all of what is free, a part of what is weakly held.
 
-        `aligned` : T_target_source is T_world_camera, `information` belongs to its left perturbation. The next call of
-        :meth:`observe` is about the answer.
+        `aligned` : T_target_source is T_world_camera, `information` belongs to its left perturbation. `rotation` is
+        R_world_camera (3, 3) where something better than this model predicted it. :meth:`observe` knows the answer.
         """
         if not aligned.unobservable:
             return aligned
         predicted, covariance = self._filtered(timestamp_s), self._covariance_at(timestamp_s)
+        if rotation is not None:
+            predicted[:3, :3] = rotation
         to_world = se3.adjoint(aligned.T_target_source)
         information = to_world.T @ aligned.information @ to_world
         innovation = se3.log(se3.inverse(predicted) @ aligned.T_target_source)
@@ -83,8 +95,9 @@ class ConstantVelocity:
         covariance = covariance * max(1.0, float(innovation @ inverse @ innovation) / known)
         gain = covariance[:, :6] @ np.linalg.solve(np.eye(6) + information @ covariance[:6, :6], information)
         change = gain @ innovation
-        self._weighed = change, covariance - gain @ covariance[:6]
-        return replace(aligned, T_target_source=predicted @ se3.exp(change[:6]))
+        answer = predicted @ se3.exp(change[:6])
+        self._weighed = answer, change, covariance - gain @ covariance[:6]
+        return replace(aligned, T_target_source=answer)
 
     def observe(self, timestamp_s: float, T_world_camera: Float64, *, partly: bool = False) -> None:
         """Take in a measured pose.
@@ -95,9 +108,9 @@ class ConstantVelocity:
         missed = before is None or self._timestamp_s != before[0]
         elapsed_s = 0.0 if before is None else timestamp_s - before[0]
         if partly:
-            if self._weighed is not None:
-                self._velocity = self._velocity + self._weighed[0][6:]
-                self._covariance = self._weighed[1]
+            if self._weighed is not None and np.array_equal(self._weighed[0], T_world_camera):
+                self._velocity = self._velocity + self._weighed[1][6:]
+                self._covariance = self._weighed[2]
             self._T_world_camera = T_world_camera
             self._unsteadiness.interrupt()
         elif before is None or elapsed_s <= 0:
@@ -145,11 +158,15 @@ class ConstantVelocity:
 
     def _covariance_at(self, timestamp_s: float) -> Float64:
         """Return the covariance (12, 12) of the prediction: the velocity changes, then the pose follows it."""
-        elapsed_s = 0.0 if self._timestamp_s is None else timestamp_s - self._timestamp_s
+        elapsed_s = SHORTEST_S if self._timestamp_s is None else max(timestamp_s - self._timestamp_s, SHORTEST_S)
         covariance = self._covariance + _covariance(np.zeros(6), self._unsteadiness.change(elapsed_s))
         follow = np.eye(12)
         follow[:6, 6:] = elapsed_s * np.eye(6)
-        return np.asarray(follow @ covariance @ follow.T)
+        covariance = follow @ covariance @ follow.T
+        # However long nothing was seen: what is known of the free directions must not drown what is seen of the others.
+        most = np.repeat([FARTHEST_OFF**2, FASTEST**2], 6)
+        scale = np.sqrt(np.minimum(1.0, most / np.maximum(np.diag(covariance), 1e-12)))
+        return np.asarray(covariance * np.outer(scale, scale))
 
     def move(self, T_new_old: Float64) -> None:
         """Take over that the world around the camera has moved (4, 4)."""
@@ -171,7 +188,8 @@ class ConstantVelocity:
         """Expect a camera that stands still: how it came to where it is was not seen."""
         self._velocity, self._in_full = np.zeros(6), False
         self._covariance = _covariance(np.zeros(6), np.full(6, FASTEST**2))
-        self._measured = None
+        self._measured = self._weighed = None
+        self._seen_velocity, self._seen_for_s = np.zeros(6), 0.0
         self._unsteadiness.interrupt()
 
     def miss(self, timestamp_s: float) -> Float64:

@@ -167,14 +167,16 @@ class Slam:
         orientation = None if orientation is None else as_rotation(orientation, "orientation")
         pyramid = pyramid or build_pyramid(frame, self.surfaces)
         clock.lap("surfaces")
-        predicted = T_world_camera
-        if predicted is None:
-            predicted = self._rotation.predict(frame.timestamp_s, self._motion.predict(frame.timestamp_s), orientation)
+        predicted = self._motion.predict(frame.timestamp_s) if T_world_camera is None else T_world_camera
+        turned = self._rotation.predict(frame.timestamp_s, predicted, orientation)
+        predicted = turned if T_world_camera is None else T_world_camera
         view = self.mapper.view(predicted, frame.camera)
         clock.lap("view")
         moved, self._moving = self._moving, None
+        if moved is not None and moved.shape != frame.camera.shape:
+            moved = None
         if T_world_camera is not None:
-            result = self._placed(frame, T_world_camera)
+            result = self._begun_anew(pyramid, self._placed(frame, T_world_camera))
         elif len(self.mapper.map) == 0:
             result = self._first(pyramid, predicted)
         else:
@@ -211,7 +213,9 @@ class Slam:
             )
         )
 
-    def refine(self, camera: PinholeCamera, config: RefinementConfig | None = None) -> Refinement:
+    def refine(
+        self, camera: PinholeCamera, config: RefinementConfig | None = None, *, apply: bool = True
+    ) -> Refinement:
         """Adjust the keyframes of the main submap together; map and trajectory move with them where that fits better.
 
         For use after the last frame. A calibration changes nothing here: the map is then to be made again with the
@@ -221,13 +225,14 @@ class Slam:
         ----------
         camera : of the frames
         config : what is estimated, and how; by default poses alone
+        apply : move map and trajectory; without it the answer is only returned
         """
         database = getattr(self.loop_closer, "database", None)  # other loop closers may keep no keyframes
         main = main_submap(self.results)
         everything = () if database is None else database.keyframes
         keyframes = [keyframe for keyframe in everything if self.results[keyframe.frame_index].submap == main]
         refined = refine_keyframes(keyframes, camera, config)
-        if refined.better and not refined.recalibrated and database is not None:
+        if apply and refined.better and not refined.recalibrated and database is not None:
             poses = [keyframe.T_world_camera for keyframe in everything]
             for index, pose in zip(refined.keyframe_ids.tolist(), refined.T_world_camera, strict=True):
                 poses[index] = pose
@@ -254,8 +259,10 @@ class Slam:
             aligned, moving = track_static(self.tracker.track, self._dynamics, pyramid, view, predicted, moved)
         else:
             aligned, moving = self.tracker.track(pyramid, view, predicted), None
+        by_gyroscope = not np.array_equal(self._motion.predict(frame.timestamp_s), predicted)
         if aligned.status is Status.DEGENERATE:
-            aligned = self._motion.weigh(frame.timestamp_s, aligned)
+            rotation = predicted[:3, :3] if by_gyroscope else None
+            aligned = self._motion.weigh(frame.timestamp_s, aligned, rotation)
         if lost_for > _SHORT_LOSS and not (aligned.status.success and is_near(aligned.T_target_source, predicted)):
             return result  # the camera may be anywhere: what fits far from the guess fits by chance
         result = self._judged(frame, predicted, aligned)
@@ -264,10 +271,9 @@ class Slam:
         if result.state is FrameState.LOST and 0 < lost_for <= _SHORT_LOSS:
             found = self._found_again(pyramid, predicted)
             result = found if found.state is not FrameState.LOST else result
-        if result.state is FrameState.LOST and lost_for == 0:
+        if result.state is FrameState.LOST and lost_for == 0 and by_gyroscope:
             T_model = self._motion.predict(frame.timestamp_s)
-            if not np.array_equal(T_model, predicted):  # it was the gyroscope that said where to look
-                return self._tracked(pyramid, self.mapper.view(T_model, frame.camera), T_model, moved)
+            return self._tracked(pyramid, self.mapper.view(T_model, frame.camera), T_model, moved)
         return result
 
     def _lost_for(self) -> int:
