@@ -19,18 +19,18 @@ def mesh(
         Path | None, Option(help="File to write: .ply, .obj or .glb. Default: RUN/mesh.ply.", metavar="FILE")
     ] = None,
     voxel: Annotated[
-        float, Option(help="Spacing of the grid [m]. Default: by pixels and noise at the usual depth.", min=0.0)
+        float, Option(help="Spacing of the grid in metres. Default: by pixels and noise at the usual depth.", min=0.0)
     ] = 0.0,
     frames: Annotated[
         str | None, Option(help="Fuse these frames. Default: all that show something new.", metavar="A:B[:STEP]")
     ] = None,
-    depth_max: Annotated[float | None, Option(help="Leave out depth beyond this [m].", min=0.1)] = None,
-    fill_holes: Annotated[float, Option(help="Close holes with a border up to this long [m].", min=0.0)] = 0.0,
+    depth_max: Annotated[float | None, Option(help="Leave out depth beyond this, in metres.", min=0.1)] = None,
+    fill_holes: Annotated[float, Option(help="Close holes with a border up to this long, in metres.", min=0.0)] = 0.0,
     from_surfels: Annotated[
         bool, Option("--from-surfels", help="Mesh the surfels of map.ply, without the sequence.")
     ] = False,
     splat: Annotated[bool, Option("--splat", help="Write Gaussian splats instead. Default: RUN/splats.ply.")] = False,
-    memory: Annotated[float | None, Option(help="Memory that the grid may take [MB].", min=1.0)] = None,
+    memory: Annotated[float | None, Option(help="Memory that the grid may take in MB; default 2000.", min=1.0)] = None,
     threads: Annotated[int | None, Option(help="Number of threads. Default: all cores.", min=1)] = None,
     json_output: Annotated[bool, Option("--json", help="Print the figures as one JSON object.")] = False,
 ) -> int:

@@ -20,7 +20,10 @@ def report(
     slam and demo write it by themselves; this makes it again from the files of the run folder, also for runs
     of earlier versions. It needs no network, and nothing else from the folder.
     """
+    from scanweld.errors import OutputError
     from scanweld.report.page import write_report
 
+    if out is not None and out.suffix.lower() not in (".html", ".htm"):
+        raise OutputError(f"{out}: the report is a page; give a name that ends in .html")
     typer.echo(f"written  {write_report(run, truth=truth, out=out)}")
     return 0

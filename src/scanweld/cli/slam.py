@@ -199,7 +199,15 @@ def summary_text(summary: RunSummary) -> str:
     ]
     if m["submaps_unjoined"]:
         rows.append(("apart", apart_text(m)))
-    rows += [("refined", found.note) for found in summary.refinements]
+    for found in summary.refinements:
+        if found.sigmas or found.held:  # the camera was to be found, too
+            camera = found.camera if found.recalibrated else None
+            numbers = (
+                f"fx {camera.fx:.2f} fy {camera.fy:.2f} cx {camera.cx:.2f} cy {camera.cy:.2f}" if camera else "as given"
+            )
+            rows.append(("camera", f"{numbers}; {found.note}"))
+        else:
+            rows.append(("refined", found.note))
     if m["ate_rmse_m"] is not None:
         rows.append(("ATE", f"{m['ate_rmse_m'] * 1e3:.2f} mm rmse, {m['ate_max_m'] * 1e3:.2f} mm at most"))
     if m["rpe_trans_m"] is not None:

@@ -70,7 +70,9 @@ def open_icl_nuim(folder: Path, overrides: Overrides) -> FileSequence:
     truths = sorted(folder.glob("*.gt.freiburg"))
     if len(truths) > 1:
         raise DatasetError(f"{folder}: {', '.join(path.name for path in truths)}: keep the truth of this sequence only")
-    truth = truths[0] if truths else first_existing(folder, ("groundtruth.txt",))
+    # The axes of ICL-NUIM's truth are its own: that of a folder which another tool wrote must not be mirrored.
+    foreign = first_existing(folder, ("camera.json", "rgb.txt", "depth.txt")) is not None
+    truth = truths[0] if truths else None if foreign else first_existing(folder, ("groundtruth.txt",))
     return build_sequence(
         folder,
         _numbered_or_listed(folder),

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from scanweld.arrays import Float32, Float64, Int32, Int64, UInt8
+from scanweld.arrays import Array, Float32, Float64, Int32, Int64, UInt8
 from scanweld.mapping import kernels
 from scanweld.mapping.kernels import PAGE, ROWS, SPAN, STRIDE
 
@@ -32,25 +32,23 @@ class PagePool:
     dirty : (capacity,) uint8, pages with a surfel that lost confidence
     """
 
-    _ARRAYS = ("pool", "counts", "boxes", "cells", "probation", "dirty")
-
     def __init__(self, capacity: int) -> None:
         self._looks = 0
-        self._allocate(max(1, capacity))
+        self._take(_arrays(max(1, capacity)))
         self._free: Int32 = np.arange(self.capacity, dtype=np.int32)[::-1].copy()
         self._num_free = self.capacity
         self._keys: Int64 = np.full(1 << 10, -1, np.int64)
         self._tails: Int32 = np.full(1 << 10, -1, np.int32)
         self._room = len(self._keys) // 2
 
-    def _allocate(self, capacity: int) -> None:
-        self.pool: Float32 = np.empty(capacity * SPAN, np.float32)
+    def _take(self, arrays: dict[str, Array]) -> None:
+        self.pool: Float32 = arrays["pool"]
         self.whole: Int32 = self.pool.view(np.int32)
-        self.counts: Int32 = np.zeros(capacity, np.int32)
-        self.boxes: Float32 = np.zeros((capacity, 6), np.float32)
-        self.cells: Int64 = np.full(capacity, -1, np.int64)
-        self.probation: Int32 = np.zeros(capacity, np.int32)
-        self.dirty: UInt8 = np.zeros(capacity, np.uint8)
+        self.counts: Int32 = arrays["counts"]
+        self.boxes: Float32 = arrays["boxes"]
+        self.cells: Int64 = arrays["cells"]
+        self.probation: Int32 = arrays["probation"]
+        self.dirty: UInt8 = arrays["dirty"]
 
     @property
     def capacity(self) -> int:
@@ -119,10 +117,12 @@ class PagePool:
         self.boxes[slot, :3], self.boxes[slot, 3:] = positions.min(axis=1), positions.max(axis=1)
 
     def _grow(self) -> None:
-        old, capacity = {name: getattr(self, name) for name in self._ARRAYS}, self.capacity
-        self._allocate(2 * capacity)
-        for name, values in old.items():
-            getattr(self, name)[: len(values)] = values
+        capacity = self.capacity
+        grown = _arrays(2 * capacity)
+        for name, values in grown.items():
+            old = getattr(self, name)
+            values[: len(old)] = old
+        self._take(grown)
         self._free = np.empty(2 * capacity, np.int32)
         self._free[:capacity] = np.arange(capacity, 2 * capacity)[::-1]
         self._num_free = capacity
@@ -137,3 +137,12 @@ class PagePool:
             k = kernels.find_cell(key, self._keys)
             self._keys[k], self._tails[k] = key, slot
         self._room = size // 2 - len(old)
+
+
+def _arrays(capacity: int) -> dict[str, Array]:
+    """Allocate what so many pages need."""
+    return {
+        "pool": np.empty(capacity * SPAN, np.float32), "counts": np.zeros(capacity, np.int32),
+        "boxes": np.zeros((capacity, 6), np.float32), "cells": np.full(capacity, -1, np.int64),
+        "probation": np.zeros(capacity, np.int32), "dirty": np.zeros(capacity, np.uint8),
+    }  # fmt: skip

@@ -24,6 +24,7 @@ from scanweld.evaluation.trajectory_metrics import AteResult, ate, rpe
 from scanweld.refinement.refine import Refinement
 from scanweld.runs.calibrated import CalibratedSequence
 from scanweld.runs.folder import check_writable, write_folder
+from scanweld.runs.interrupts import Patience
 from scanweld.runs.output import write_run
 from scanweld.runs.refining import calibrate as calibrate_camera
 from scanweld.runs.refining import described
@@ -127,50 +128,51 @@ def run_sequence(
     config = config or SlamConfig()
     if out is not None:
         check_writable(out, force=force)
-    given = None if poses is None else _poses_by_frame(sequence, poses)
-    slam = build_slam(sequence.camera, config)
-    tally = _Tally()
-    interrupted = False
-    refinements: list[Refinement] = []
-    try:
-        _process_all(slam, sequence, given, tally, progress)
-        if calibrate:
-            calibrated, found = calibrate_camera(slam, sequence, config.refinement)
-            refinements.append(found)
-            if found.recalibrated:
-                again = build_slam(calibrated.camera, config)
-                _process_all(again, calibrated, None, _Tally(), progress)
-                slam, sequence = again, calibrated  # together: an interrupted second run leaves the first
-        if refine:
-            poses_alone = replace(config.refinement, calibrate_intrinsics=False, calibrate_depth=False)
-            refinements.append(slam.refine(sequence.camera, poses_alone))
-    except KeyboardInterrupt:
-        if not any(result.state in POSED for result in slam.results):
-            raise  # there is nothing to keep
-        interrupted = True
-        tally.warn(f"interrupted after {len(slam.results)} of {len(sequence)} frames")
-    tracked = any(result.state in POSED for result in slam.results)
-    if not tracked or len(slam.map) == 0:  # frames at given poses need no surfaces
-        why = explain_unusable_depth(tally.median_depth_m, sequence.depth_scale, (0.0, config.surfaces.max_depth_m))
-        raise DatasetError(f"{sequence.name}: no frame has usable depth, the map is empty; {why}")
-    metrics, error = summarise(slam, sequence.ground_truth, tally.num_points_input)
-    metrics["seconds_total"] = time.perf_counter() - started
-    summary = RunSummary(out, metrics, tuple(slam.main_results), slam.map, interrupted, tuple(refinements))
-    if out is not None:
-        with write_folder(out, force=force) as aside:
-            write_run(
-                aside, slam, sequence, config, metrics, error,
-                tracked_only=tracked_only,
-                description={
-                    **(description or {}),
-                    "warnings": [*(description or {}).get("warnings", ()), *tally.warnings],
-                    "interrupted": interrupted,
-                    **({"calibrated": isinstance(sequence, CalibratedSequence)} if calibrate else {}),
-                    **({"refinements": described(refinements)} if refinements else {}),
-                },
-                started=started,
-            )  # fmt: skip
-    return summary
+    with Patience() as patience:  # a frame is in the map and in the trajectory, or in neither
+        given = None if poses is None else _poses_by_frame(sequence, poses)
+        slam = build_slam(sequence.camera, config)
+        tally = _Tally()
+        interrupted = False
+        refinements: list[Refinement] = []
+        try:
+            _process_all(slam, sequence, given, tally, progress, patience)
+            if calibrate:
+                calibrated, found = calibrate_camera(slam, sequence, config.refinement)
+                refinements.append(found)
+                if found.recalibrated:
+                    again = build_slam(calibrated.camera, config)
+                    _process_all(again, calibrated, None, _Tally(), progress, patience)
+                    slam, sequence = again, calibrated  # together: an interrupted second run leaves the first
+            if refine:
+                poses_alone = replace(config.refinement, calibrate_intrinsics=False, calibrate_depth=False)
+                refinements.append(slam.refine(sequence.camera, poses_alone))
+        except KeyboardInterrupt:
+            if not any(result.state in POSED for result in slam.results):
+                raise  # there is nothing to keep
+            interrupted = True
+            tally.warn(f"interrupted after {len(slam.results)} of {len(sequence)} frames")
+        tracked = any(result.state in POSED for result in slam.results)
+        if not tracked or len(slam.map) == 0:  # frames at given poses need no surfaces
+            why = explain_unusable_depth(tally.median_depth_m, sequence.depth_scale, (0.0, config.surfaces.max_depth_m))
+            raise DatasetError(f"{sequence.name}: no frame has usable depth, the map is empty; {why}")
+        metrics, error = summarise(slam, sequence.ground_truth, tally.num_points_input)
+        metrics["seconds_total"] = time.perf_counter() - started
+        summary = RunSummary(out, metrics, tuple(slam.main_results), slam.map, interrupted, tuple(refinements))
+        if out is not None:
+            with write_folder(out, force=force) as aside:
+                write_run(
+                    aside, slam, sequence, config, metrics, error,
+                    tracked_only=tracked_only,
+                    description={
+                        **(description or {}),
+                        "warnings": [*(description or {}).get("warnings", ()), *tally.warnings],
+                        "interrupted": interrupted,
+                        **({"calibrated": isinstance(sequence, CalibratedSequence)} if calibrate else {}),
+                        **({"refinements": described(refinements)} if refinements else {}),
+                    },
+                    started=started,
+                )  # fmt: skip
+        return summary
 
 
 def _process_all(
@@ -179,6 +181,7 @@ def _process_all(
     given: list[Float64 | None] | None,
     tally: _Tally,
     progress: Progress | None,
+    patience: Patience,
 ) -> None:
     gyroscope = gyroscope_of(sequence)
     turned = [None] * len(sequence) if gyroscope is None else gyroscope.orientations(sequence.timestamps_s)
@@ -205,6 +208,7 @@ def _process_all(
                 )
             if progress is not None:
                 progress(result)
+            patience.check()
 
 
 def _poses_by_frame(sequence: RgbdSequence, poses: Trajectory) -> list[Float64 | None]:

@@ -37,6 +37,7 @@ def text(
     """Return the result as lines for a person."""
     from scanweld.registration.pictures import VERDICTS
 
+    answered = result.status.has_pose
     matrix = ["  ".join(f"{value + 0.0:12.6f}" for value in row) for row in result.T_target_source.round(9)]
     # The free directions have their own rows, so the part of the note that lists them is left out.
     free = [direction.words for direction in result.unobservable]
@@ -47,11 +48,10 @@ def text(
         ("", "; ".join(parts)),
         *(("left free" if k == 0 else "", words) for k, words in enumerate(free)),
         ("method", f"{method}, {_counted(result.num_iterations, 'iteration')}, {seconds:.3f} s"),
-        ("T_target_source", matrix[0]),
-        *(("", row) for row in matrix[1:]),
+        *(("" if k else "T_target_source", row) for k, row in enumerate(matrix if answered else ())),
         ("scale", scale if result.scale != 1 else ""),
         ("uncertainty", _uncertainty(result, source)),
-        ("rmse", f"{result.rmse_m:.4g} m over {_counted(result.num_inliers, 'pair')}"),
+        ("rmse", "" if not answered else f"{result.rmse_m:.4g} m over {_counted(result.num_inliers, 'pair')}"),
         ("overlap", f"{result.overlap:.1%} of the source"),
         ("aligned source", "" if out is None else str(out)),
         ("plot", "" if plot is None else str(plot)),
