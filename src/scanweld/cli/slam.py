@@ -201,10 +201,8 @@ def summary_text(summary: RunSummary) -> str:
         rows.append(("apart", apart_text(m)))
     for found in summary.refinements:
         if found.sigmas or found.held:  # the camera was to be found, too
-            camera = found.camera if found.recalibrated else None
-            numbers = (
-                f"fx {camera.fx:.2f} fy {camera.fy:.2f} cx {camera.cx:.2f} cy {camera.cy:.2f}" if camera else "as given"
-            )
+            c = found.camera
+            numbers = f"fx {c.fx:.2f} fy {c.fy:.2f} cx {c.cx:.2f} cy {c.cy:.2f}" if found.recalibrated else "as given"
             rows.append(("camera", f"{numbers}; {found.note}"))
         else:
             rows.append(("refined", found.note))
