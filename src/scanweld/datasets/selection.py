@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+
+import numpy as np
 
 from scanweld.arrays import Float64
 from scanweld.datasets.base import RgbdSequence, WrappedSequence
@@ -17,12 +20,12 @@ from scanweld.geometry.frame import Frame
 class SelectedSequence(WrappedSequence):
     """The frames of `base` at `indices`, in that order; timestamps and ground truth stay as they are."""
 
-    indices: range
+    indices: Sequence[int]
 
     @property
     def timestamps_s(self) -> Float64:
         """Time of the selected frames (N,) [s]."""
-        return self.base.timestamps_s[self.indices.start : self.indices.stop : self.indices.step]
+        return self.base.timestamps_s[np.asarray(self.indices, np.int64)]
 
     def __len__(self) -> int:
         return len(self.indices)

@@ -13,7 +13,7 @@ import numpy as np
 
 from scanweld.arrays import Array, Int64, finite_rows
 from scanweld.datasets.base import RgbdSequence
-from scanweld.datasets.selection import parse_frames
+from scanweld.datasets.selection import SelectedSequence, parse_frames
 from scanweld.datasets.stream import stream
 from scanweld.errors import DatasetError, FileFormatError, InvalidInputError, OutputError, UnreadableFrameError
 from scanweld.geometry.frame import Frame
@@ -25,7 +25,7 @@ from scanweld.meshing.config import MeshConfig
 from scanweld.meshing.fuse import Progress, finished_mesh, frames_with_news, median_depth_m, voxel_for
 from scanweld.meshing.splats import SURFEL_COLUMNS, splats_from_surfels
 from scanweld.meshing.volume import GridTooLargeError, SurfaceFrame, TsdfVolume, prepare_frame
-from scanweld.runs.reopen import PickedSequence, PosedFrames, posed_frames, read_description, reopen_sequence
+from scanweld.runs.reopen import PosedFrames, posed_frames, read_description, reopen_sequence
 
 logger = logging.getLogger(__name__)
 
@@ -193,7 +193,7 @@ def _fuse_at(
     sequence: RgbdSequence, posed: PosedFrames, voxel_m: float, config: MeshConfig, progress: Progress | None
 ) -> TsdfVolume:
     volume = TsdfVolume(voxel_m, config)
-    picked = PickedSequence(sequence, posed.rows)
+    picked = SelectedSequence(sequence, posed.rows.tolist())
 
     def prepare(frame: Frame) -> SurfaceFrame:
         return prepare_frame(frame, config.surfaces)

@@ -10,13 +10,12 @@ from typing import Any
 
 from scanweld.arrays import Bool, Float64, Int64
 from scanweld.config import from_mapping
-from scanweld.datasets.base import RgbdSequence, WrappedSequence
+from scanweld.datasets.base import RgbdSequence
 from scanweld.datasets.intrinsics import parse_intrinsics
 from scanweld.datasets.open import open_sequence
 from scanweld.datasets.synthetic import RenderConfig, SyntheticSequence
 from scanweld.errors import DatasetError, FileFormatError
 from scanweld.geometry.camera import PinholeCamera
-from scanweld.geometry.frame import Frame
 from scanweld.io.trajectory_files import read_trajectory
 from scanweld.refinement.calibration import DepthCorrection
 from scanweld.report.run_files import FrameTable, poses_of_frames, read_frames
@@ -40,25 +39,6 @@ class PosedFrames:
     def select(self, chosen: Bool | Int64) -> PosedFrames:
         """Return the chosen ones, a mask or indices."""
         return PosedFrames(self.rows[chosen], self.T_world_camera[chosen])
-
-
-@dataclass(frozen=True, slots=True)
-class PickedSequence(WrappedSequence):
-    """The frames of `base` with the numbers `rows`."""
-
-    rows: Int64
-
-    @property
-    def timestamps_s(self) -> Float64:
-        """Time of the picked frames (N,) [s]."""
-        return self.base.timestamps_s[self.rows]
-
-    def __len__(self) -> int:
-        return len(self.rows)
-
-    def read(self, index: int) -> Frame:
-        """Decode picked frame `index`."""
-        return self.base.read(int(self.rows[index]))
 
 
 def read_description(folder: Path) -> Mapping[str, Any]:
