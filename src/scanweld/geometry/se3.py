@@ -28,8 +28,10 @@ def hat(phi: npt.ArrayLike) -> Float64:
     return matrix
 
 
-def _coefficients(phi: Float64) -> tuple[Float64, Float64, Float64]:
+def _coefficients(phi: Float64) -> tuple[Float64 | float, Float64 | float, Float64 | float]:
     """sin t / t, (1 - cos t) / t^2 and (t - sin t) / t^3 with t = |phi|, shaped (..., 1, 1)."""
+    if phi.ndim == 1:  # arrays of one number would take most of a tracker's time
+        return _coefficients_of_one(*phi.tolist())
     t = np.linalg.norm(phi, axis=-1)[..., None, None]
     small = t < _SMALL
     s = np.where(small, 1.0, t)
@@ -42,6 +44,14 @@ def _coefficients(phi: Float64) -> tuple[Float64, Float64, Float64]:
     return a, b, c
 
 
+def _coefficients_of_one(x: float, y: float, z: float) -> tuple[float, float, float]:
+    t = math.sqrt(x * x + y * y + z * z)
+    c = 1 / 6 - t**2 / 120 + t**4 / 5040 if t < 0.02 else (t - math.sin(t)) / t**3
+    if t < _SMALL:
+        return 1 - t**2 / 6, 0.5 - t**2 / 24, c
+    return math.sin(t) / t, 2 * (math.sin(t / 2) / t) ** 2, c
+
+
 def exp_so3(phi: npt.ArrayLike) -> Float64:
     """Return the rotations (..., 3, 3) about vectors (..., 3) by their length [rad] (Rodrigues)."""
     v = np.asarray(phi, dtype=np.float64)
@@ -52,6 +62,11 @@ def exp_so3(phi: npt.ArrayLike) -> Float64:
 
 def log_so3(rotation: npt.ArrayLike) -> Float64:
     """Return the rotation vectors (..., 3) [rad], angle in [0, pi], of rotations (..., 3, 3)."""
+    if np.ndim(rotation) == 2:
+        *vector, w = _quaternion_of_one(np.asarray(rotation, dtype=np.float64).tolist())
+        sine = math.hypot(*vector)
+        factor = 2 + sine**2 / 3 if sine < _SMALL else 2 * math.atan2(sine, w) / sine
+        return factor * np.array(vector)
     q = quaternion_xyzw_from_rotation(rotation)
     vector, w = q[..., :3], q[..., 3:]
     sine = np.linalg.norm(vector, axis=-1, keepdims=True)
@@ -137,13 +152,13 @@ def left_jacobian_inverse(xi: npt.ArrayLike) -> Float64:
 
 def _left_jacobian_so3_inverse(phi: Float64) -> Float64:
     """I - hat/2 + k hat^2, k = (1 - (t/2) cot(t/2)) / t^2 (Solà eq. 146)."""
+    matrix = hat(phi)
     angle = np.linalg.norm(phi, axis=-1)[..., None, None]
     small = angle < 0.02
     s = np.where(small, 1.0, angle)
     with np.errstate(divide="ignore"):
         cotangent = 1 / np.tan(s / 2)
     k = np.where(small, 1 / 12 + angle**2 / 720 + angle**4 / 30240, (1 - s / 2 * cotangent) / s**2)
-    matrix = hat(phi)
     return np.asarray(np.eye(3) - matrix / 2 + k * (matrix @ matrix))
 
 
@@ -220,6 +235,8 @@ def from_quaternion_xyzw(quaternion_xyzw: npt.ArrayLike, translation_m: npt.Arra
 def quaternion_xyzw_from_rotation(rotation: npt.ArrayLike) -> Float64:
     """Return unit quaternions (..., 4) with w >= 0 of rotations (..., 3, 3) (Shepperd: largest component first)."""
     R = np.asarray(rotation, dtype=np.float64)
+    if R.ndim == 2:
+        return np.array(_quaternion_of_one(R.tolist()))
     m00, m11, m22 = R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]
     # Row k is 4 q_k q: all four are the same quaternion, the one with the largest q_k is well conditioned.
     sum_01, sum_02, sum_12 = (R[..., i, j] + R[..., j, i] for i, j in ((0, 1), (0, 2), (1, 2)))
@@ -237,3 +254,15 @@ def quaternion_xyzw_from_rotation(rotation: npt.ArrayLike) -> Float64:
     q = np.take_along_axis(rows, largest[..., None, None], axis=-2)[..., 0, :]
     q = q / np.linalg.norm(q, axis=-1, keepdims=True)
     return np.asarray(np.where(q[..., 3:] < 0, -q, q))
+
+
+def _quaternion_of_one(rotation: list[list[float]]) -> tuple[float, float, float, float]:
+    (a, b, c), (d, e, f), (g, h, i) = rotation
+    x, y, z = h - f, c - g, d - b
+    rows = (
+        (1 + a - e - i, b + d, c + g, x), (b + d, 1 - a + e - i, f + h, y), (c + g, f + h, 1 - a - e + i, z),
+        (x, y, z, 1 + a + e + i),
+    )  # fmt: skip
+    row = rows[max(range(4), key=lambda k: rows[k][k])]
+    scale = math.copysign(1 / math.hypot(*row), row[3])
+    return row[0] * scale, row[1] * scale, row[2] * scale, row[3] * scale
