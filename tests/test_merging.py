@@ -44,9 +44,12 @@ def add(
     )  # fmt: skip
 
 
-def moved(surfels: SurfelMap) -> np.ndarray:
-    """How far a correction that turns the later passes towards the earlier ones has moved each surfel."""
-    return np.repeat(surfels.anchors[None] * np.float32(0.01), 3, axis=0)
+def moved(surfels: SurfelMap, shift_m: float = 0.01) -> MapCorrection:
+    """The correction that has brought a map to where it is: each pass moved by so much more than the one before."""
+    anchors = np.unique(surfels.anchors).astype(np.int32)
+    T = np.tile(np.eye(4), (len(anchors), 1, 1))
+    T[:, :3, 3] = shift_m * anchors[:, None]
+    return MapCorrection(anchors, T)
 
 
 class TestMergeDoubled:
@@ -112,10 +115,10 @@ class TestMergeDoubled:
         surfels = SurfelMap()
         add(surfels, wall(), anchor=0)
         add(surfels, wall(height=0.01), anchor=20)
-        assert merge_doubled(surfels, np.full((3, len(surfels)), 0.3, np.float32), 100.0) == 0
+        assert merge_doubled(surfels, moved(surfels, 0.0), 100.0) == 0
 
     def test_off_and_empty(self) -> None:
-        assert merge_doubled(SurfelMap(), np.zeros((3, 0), np.float32), 100.0) == 0
+        assert merge_doubled(SurfelMap(), moved(SurfelMap()), 100.0) == 0
         surfels = SurfelMap()
         add(surfels, wall(), anchor=0)
         add(surfels, wall(height=0.01), anchor=20)

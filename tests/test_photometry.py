@@ -25,7 +25,7 @@ from scanweld.registration.photometric.residuals import (
     photometric_sums,
     reference_rows,
 )
-from scanweld.tracking.rotation import RotationPrior, find_turns, thumbnails
+from scanweld.tracking.rotation import find_turns, thumbnails
 from walls import wall_frame
 
 GATE_M, MIN_COSINE = 0.05, 0.7
@@ -372,22 +372,3 @@ class TestTurns:
                 found[mode] += result.status.has_pose and shift < 0.01 and turn < 0.5
         assert found["auto"] == 4
         assert found["off"] < 4
-
-    def test_measured_rotation(self) -> None:
-        """A gyroscope brings back a prediction 20 degrees off, and a contradicted one takes the pose away."""
-        sequence = rendered(count=40)
-        mapper, true = map_of(sequence, 10), sequence.ground_truth.T_world_camera[10]
-        frame = replace(sequence.frames[10], color=None)
-        guess = true @ se3.exp([0.02, 0, -0.02, 0, np.radians(20), 0])
-        view, pyramid = mapper.view(guess, CAMERA), sw.build_pyramid(frame)
-        tracker = sw.FrameToModelTracker()
-        prior = RotationPrior(
-            rotation_world_camera=true[:3, :3] @ se3.exp([0, 0, 0, 0.005, 0, 0])[:3, :3], std_rad=0.01
-        )
-        result = tracker.track(pyramid, view, guess, rotation_prior=prior)
-        assert result.status is sw.Status.CONVERGED
-        assert pose_error(result.T_target_source, true)[0] < 2e-3
-        wrong = RotationPrior(rotation_world_camera=(true @ se3.exp([0, 0, 0, 0, 0.08, 0]))[:3, :3], std_rad=0.005)
-        result = tracker.track(pyramid, mapper.view(true, CAMERA), true, rotation_prior=wrong)
-        assert result.status is sw.Status.NO_OVERLAP
-        assert "from the measured rotation" in result.note

@@ -7,8 +7,8 @@ import pytest
 
 import scanweld as sw
 from scanweld.geometry import se3
-from scanweld.mapping.pages import CELL_M
 from scanweld.mapping.rendering import find_candidates, render_index_map, render_model_view, render_picture
+from scanweld.mapping.storage.pages import CELL_M
 
 SMALL = sw.PinholeCamera(40.0, 42.0, 19.3, 14.8, 40, 30)
 POSE = se3.exp([0.3, -0.2, 0.1, 0.4, -0.3, 0.2])
@@ -37,15 +37,11 @@ def seen_from(surfels: sw.SurfelMap, T_world_camera: np.ndarray) -> tuple[np.nda
         return p, n, SMALL.fx * p[0] / p[2] + SMALL.cx, SMALL.fy * p[1] / p[2] + SMALL.cy
 
 
-def index_map_of(surfels: sw.SurfelMap, T_world_camera: np.ndarray, stable: float = 0) -> tuple[np.ndarray, ...]:
-    """The index map with the places of the surfels in the map's properties, and how full its rows are."""
+def index_map_of(surfels: sw.SurfelMap, T_world_camera: np.ndarray, stable: float = 0) -> np.ndarray:
+    """The index map with the places of the surfels in the map's properties."""
     candidates = find_candidates(surfels, T_world_camera, SMALL)
     seen = render_index_map(surfels, candidates, T_world_camera, SMALL, stable)
-    return places_of(surfels, seen.numbers), seen.row_counts
-
-
-def places_of(surfels: sw.SurfelMap, numbers: np.ndarray) -> np.ndarray:
-    return np.where(numbers >= 0, surfels.rows_of(np.maximum(numbers, 0)), -1)
+    return np.where(seen.numbers >= 0, surfels.rows_of(np.maximum(seen.numbers, 0)), -1)
 
 
 def reference_index_map(surfels: sw.SurfelMap, T_world_camera: np.ndarray, stable: float) -> np.ndarray:
@@ -67,9 +63,7 @@ def reference_index_map(surfels: sw.SurfelMap, T_world_camera: np.ndarray, stabl
 @pytest.mark.parametrize("count", [0, 1, 5000, 12_000])
 def test_index_map_matches_a_numpy_z_buffer(count: int, stable: float) -> None:
     surfels = cloud(1, count)
-    index_map, row_counts = index_map_of(surfels, POSE, stable)
-    np.testing.assert_array_equal(index_map, reference_index_map(surfels, POSE, stable))
-    np.testing.assert_array_equal(row_counts, (index_map >= 0).sum(axis=1))
+    np.testing.assert_array_equal(index_map_of(surfels, POSE, stable), reference_index_map(surfels, POSE, stable))
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -112,20 +106,16 @@ def test_model_view_gathers_the_surfels_of_its_pixels() -> None:
     mapper = sw.SurfelMapper()
     mapper.map = surfels
     seen = mapper.view(POSE, SMALL)
-    ids = surfels.rows_of(seen.index_map[seen.index_map >= 0])
-    assert len(seen) == len(ids) > 100
-    np.testing.assert_array_equal(seen.pixels, np.flatnonzero(seen.index_map.ravel() >= 0))
+    expected = index_map_of(surfels, POSE, mapper.config.stable_confidence)
+    np.testing.assert_array_equal(seen.index_map >= 0, expected >= 0)
+    assert len(seen) == (expected >= 0).sum() > 100
+    np.testing.assert_array_equal(seen.index_map.ravel()[seen.pixels], np.arange(len(seen)))
+    ids = expected.ravel()[seen.pixels]
     np.testing.assert_array_equal(seen.positions_m, surfels.positions_m[:, ids])
     np.testing.assert_array_equal(seen.normals, surfels.normals[:, ids])
     np.testing.assert_array_equal(seen.confidences, surfels.confidences[ids])
     grey = np.array([0.299, 0.587, 0.114]) @ surfels.colors[:, ids]
     np.testing.assert_allclose(seen.intensities, grey, atol=1e-3)
-    rows = np.array([5, 3, 99])
-    some = seen.take(rows)
-    np.testing.assert_array_equal(some.positions_m, seen.positions_m[:, rows])
-    np.testing.assert_array_equal(some.normals, seen.normals[:, rows])
-    np.testing.assert_array_equal(some.confidences, seen.confidences[rows])
-    np.testing.assert_array_equal(some.intensities, seen.intensities[rows])
 
 
 def test_view_outlives_changes_of_the_map() -> None:
@@ -138,16 +128,14 @@ def test_view_outlives_changes_of_the_map() -> None:
     np.testing.assert_array_equal(seen.positions_m, expected)
 
 
-def test_plain_view_and_its_rows() -> None:
+def test_plain_view_and_its_pixels() -> None:
     """A mapper of somebody else's may hand over arrays."""
     points, index_map = np.arange(12, dtype=np.float32).reshape(3, 4), np.full(SMALL.shape, -1, np.int32)
+    index_map[3, [9, 5, 7, 2]] = np.arange(4)
     view = sw.ModelView(POSE, SMALL, points, -points, points[0], index_map)
     assert len(view) == 4
-    some = view.take(np.array([2, 0]))
-    np.testing.assert_array_equal(some.positions_m, points[:, [2, 0]])
-    np.testing.assert_array_equal(some.normals, -points[:, [2, 0]])
-    np.testing.assert_array_equal(some.confidences, [2, 0])
-    assert some.intensities is None
+    assert view.pixels.tolist() == [3 * SMALL.width + u for u in (9, 5, 7, 2)]
+    assert view.intensities is None
 
 
 def test_speck_does_not_hide_the_surface_it_belongs_to() -> None:
@@ -155,14 +143,14 @@ def test_speck_does_not_hide_the_surface_it_belongs_to() -> None:
     for nearer, winner in ((0.99, 0), (0.97, 1)):
         surfels = append_disc(sw.SurfelMap(), [0, 0, 1], [0, 0, -1], 0.05, confidence=9)
         append_disc(surfels, [0, 0, nearer], [0, 0, -1], 0.05, confidence=1)
-        assert index_map_of(surfels, np.eye(4), stable=5.0)[0].max() == winner
+        assert index_map_of(surfels, np.eye(4), stable=5.0).max() == winner
 
 
 def test_equal_depth_has_one_winner() -> None:
     """Two surfels in one place: the first one wins, always."""
     surfels = disc([0, 0, 1], [0, 0, -1], 0.05)
     surfels.append(surfels.positions_m, surfels.normals, surfels.colors, surfels.radii_m, surfels.confidences, 0)
-    index_map, _ = index_map_of(surfels, np.eye(4))
+    index_map = index_map_of(surfels, np.eye(4))
     assert index_map.max() == 0
 
 
@@ -171,7 +159,7 @@ def test_far_surfels_do_not_win_by_overflow(far_m: float) -> None:
     """The depth in micrometres must fit its part of the key, however far a surfel is."""
     surfels = disc([0, 0, far_m], [0, 0, -1], 0.05)
     append_disc(surfels, [0, 0, 1], [0, 0, -1], 0.05)
-    index_map, _ = index_map_of(surfels, np.eye(4))
+    index_map = index_map_of(surfels, np.eye(4))
     assert set(np.unique(index_map)) == {-1, 1}
 
 
@@ -256,7 +244,7 @@ def test_view_does_not_depend_on_the_world_frame() -> None:
     positions = (T[:3, :3] @ surfels.positions_m + T[:3, 3:]).astype(np.float32)
     normals = (T[:3, :3] @ surfels.normals).astype(np.float32)
     moved.append(positions, normals, surfels.colors, surfels.radii_m, surfels.confidences, 0)
-    a, b = index_map_of(surfels, POSE)[0], index_map_of(moved, T @ POSE)[0]
+    a, b = index_map_of(surfels, POSE), index_map_of(moved, T @ POSE)
     assert (a >= 0).sum() > 300
     # Their confidences name them: the two maps keep them in orders of their own.
     a, b = (np.where(k >= 0, m.confidences[k], -1) for k, m in ((a, surfels), (b, moved)))

@@ -151,7 +151,7 @@ class TestTogether:
         seen = slam.mapper.view(se3.inverse(step[0]) @ step[340], CAMERA)
         T_camera_world = se3.inverse(se3.inverse(step[0]) @ step[340])
         z = se3.transform_points(T_camera_world, seen.positions_m.T.astype(np.float64))[:, 2]
-        true = depth_m[seen.index_map >= 0]
+        true = depth_m.ravel()[seen.pixels]
         assert np.median(np.abs(z - true)[true > 0]) < 6e-3
 
     def test_a_loss_on_the_way_is_found_again_in_the_old_map(self, apart: Walk) -> None:

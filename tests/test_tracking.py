@@ -62,9 +62,9 @@ class TestTracker:
         view, pyramid = mapper.view(guess, CAMERA), sw.build_pyramid(sequence.frames[5])
         tracker = sw.FrameToModelTracker(sw.TrackingConfig(photometry="off"))
         tracked = tracker.track(pyramid, view, guess)
-        _, source = tracker._select(view)
+        rows = tracker._select(view)
         aligned = align_projective(
-            source.positions_m, source.normals, pyramid.levels, se3.inverse(guess), tracker.config.projective
+            view.positions_m[:, rows], view.normals[:, rows], pyramid.levels, se3.inverse(guess), tracker.config.projective
         )
         T_wc, T_cw = tracked.T_target_source, aligned.T_target_source
         np.testing.assert_allclose(T_wc @ T_cw, np.eye(4), atol=1e-12)
@@ -138,7 +138,7 @@ class TestTracker:
         stable = view.confidences >= view.stable_confidence
         assert stable.mean() > 0.5  # so the others are left out
         tracker = sw.FrameToModelTracker(sw.TrackingConfig(stable_fraction=0.1))
-        positions = tracker._select(view)[1].positions_m
+        positions = view.positions_m[:, tracker._select(view)]
         assert positions.shape == (3, round(0.1 * stable.sum()))
         taken = self.taken(positions, view)
         limit = np.sort(view.confidences)[-positions.shape[1]]
@@ -153,7 +153,8 @@ class TestTracker:
         view = mapper.view(rendered(count=40).ground_truth.T_world_camera[0], CAMERA)
         for share, expected in ((0.3, 1.0), (0.7, 0.7)):
             confidences = np.where(np.random.default_rng(1).random(len(view)) < share, 9, 1).astype(np.float32)
-            positions = sw.FrameToModelTracker()._select(of_confidence(view, confidences))[1].positions_m
+            rows = sw.FrameToModelTracker()._select(of_confidence(view, confidences))
+            positions = view.positions_m[:, rows]
             assert positions.shape[1] / len(view) == pytest.approx(expected, abs=0.02)
 
     @pytest.mark.parametrize("confidence", [1.0, 100.0])
@@ -163,7 +164,7 @@ class TestTracker:
         view = mapper.view(rendered(count=40).ground_truth.T_world_camera[0], CAMERA)
         view = of_confidence(view, np.full(len(view), confidence, np.float32))
         tracker = sw.FrameToModelTracker(sw.TrackingConfig(stable_fraction=0.1))
-        positions = tracker._select(view)[1].positions_m
+        positions = view.positions_m[:, tracker._select(view)]
         places = np.flatnonzero(self.taken(positions, view)) / len(view)
         assert len(places) == positions.shape[1] == round(0.1 * len(view))
         np.testing.assert_allclose(np.percentile(places, [5, 25, 50, 75, 95]), [0.05, 0.25, 0.5, 0.75, 0.95], atol=0.02)
@@ -172,7 +173,7 @@ class TestTracker:
         mapper = map_of(rendered(count=40), 1)
         view = mapper.view(rendered(count=40).ground_truth.T_world_camera[0], CAMERA)
         config = sw.TrackingConfig(stable_fraction=0.001)
-        positions = sw.FrameToModelTracker(config)._select(view)[1].positions_m
+        positions = view.positions_m[:, sw.FrameToModelTracker(config)._select(view)]
         assert positions.shape[1] == config.projective.min_points
 
     @staticmethod

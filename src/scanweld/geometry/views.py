@@ -10,27 +10,10 @@ from scanweld.arrays import Float32, Float64, Int32, Int64
 from scanweld.geometry.camera import PinholeCamera
 
 
-@dataclass(frozen=True, slots=True)
-class ModelRows:
-    """Some of the surfels that a camera sees: positions_m, normals (3, M) float32; confidences, intensities (M,)."""
-
-    positions_m: Float32
-    normals: Float32
-    confidences: Float32
-    intensities: Float32 | None = None
-
-    def take(self, rows: Int64) -> ModelRows:
-        """Return some of the rows (M,), in the given order."""
-        return ModelRows(
-            np.take(self.positions_m, rows, axis=1), np.take(self.normals, rows, axis=1), self.confidences[rows],
-            None if self.intensities is None else self.intensities[rows],
-        )  # fmt: skip
-
-
 class ModelView:
     """The surfels that a camera sees, one at most per pixel, as rows of equal length N.
 
-    Rows are in the order of the pixels (row-major), so a strided subset is spread over the image.
+    Neighbouring rows are mostly neighbours in the image; `index_map` leads through them in the order of its pixels.
 
     Attributes
     ----------
@@ -39,7 +22,7 @@ class ModelView:
     positions_m : (3, N) float32, world frame [m]
     normals : (3, N) float32, world frame, unit, towards the camera
     confidences : (N,) float32
-    index_map : (H, W) int32, the surfel behind each pixel, -1 where none; its numbers mean something to the map only
+    index_map : (H, W) int32, the row of the surfel behind each pixel, -1 where none
     intensities : (N,) float32, luminance 0..255, or None where the mapper does not give it
     stable_confidence : from this confidence on a surfel is stable
     """
@@ -71,9 +54,13 @@ class ModelView:
     def __len__(self) -> int:
         return int(self.positions_m.shape[1])
 
-    def take(self, rows: Int64) -> ModelRows:
-        """Return some of the rows (M,), in the given order."""
-        return ModelRows(self.positions_m, self.normals, self.confidences, self.intensities).take(rows)
+    @property
+    def pixels(self) -> Int64:
+        """(N,) int64, row-major, the pixel of each row."""
+        seen = np.flatnonzero(self.index_map >= 0)
+        pixels = np.zeros(len(self), np.int64)
+        pixels[self.index_map.reshape(-1)[seen]] = seen
+        return pixels
 
 
 @dataclass(frozen=True, slots=True)

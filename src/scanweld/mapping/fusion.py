@@ -11,9 +11,11 @@ from scanweld.arrays import Bool, Float32, Float64, Int32
 from scanweld.config import check_ranges, section, setting
 from scanweld.geometry.camera import PinholeCamera
 from scanweld.geometry.depth import SurfacePyramid, as_kernel_input, intrinsics_array
+from scanweld.geometry.views import ModelView
 from scanweld.mapping import kernels
 from scanweld.mapping.merging import MergingConfig
-from scanweld.mapping.rendering import DepthBuffers, SurfelView, render_index_map, shade
+from scanweld.mapping.rendering import DepthBuffers, as_view, render_index_map
+from scanweld.mapping.storage.kernels import ROWS
 from scanweld.mapping.surfel_map import SurfelMap
 from scanweld.parallel import run_ranges
 
@@ -87,7 +89,7 @@ def fuse(
     config: FusionConfig,
     moving: Bool | None = None,
     depth_buffers: DepthBuffers | None = None,
-) -> tuple[FusionCounts, SurfelView]:
+) -> tuple[FusionCounts, ModelView]:
     """Merge a frame into the map, in place; returns what happened, and the map as it was seen, without what is new.
 
     Pixels in `moving` (H, W) add nothing to the map, and surfels that they lie on are demoted to the confidence of one
@@ -109,39 +111,40 @@ def fuse(
     ], np.float32)  # fmt: skip
     seen = render_index_map(surfels, candidates, T_world_camera, camera, config.stable_confidence, depth_buffers)
     pages = surfels.pages
-    merged = np.zeros(camera.width * camera.height + 1, np.uint8)
+    merged = np.zeros(camera.shape, np.uint8)
     pending, counts = np.empty(camera.shape, np.int32), np.empty(camera.height, np.int32)
+
+    offsets, shown, values = seen.room()
 
     def merge(start: int, stop: int) -> None:
         kernels.merge_pages(
-            start, stop, seen.slots, pages.counts, seen.landed, seen.numbers.reshape(-1), surface.reshape(-1),
+            start, stop, seen.slots, pages.counts, seen.places, seen.pixels, seen.won, offsets, surface.reshape(-1),
             color.reshape(-1), weights.reshape(-1), transform, parameters, camera.width, camera.height, frame_id,
-            pages.pool, pages.whole, pages.dirty, merged,
+            pages.pool, pages.whole, pages.dirty, merged.reshape(-1), shown.reshape(-1), values,
         )  # fmt: skip
 
     def cover(start: int, stop: int) -> None:
         kernels.cover_rows(
-            start, stop, seen.numbers, image.reshape(-1), merged[:-1].reshape(camera.shape), surface.reshape(-1),
-            moving, transform, intrinsics, parameters, pending, counts,
+            start, stop, shown, values, merged, surface.reshape(-1), moving, transform, intrinsics, parameters, pending,
+            counts,
         )  # fmt: skip
 
     run_ranges(len(seen.slots), merge)
-    image = shade(surfels, seen)  # a neighbour covers a pixel from where it has come to
     run_ranges(camera.height, cover)
-    offsets = np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
-    new, anchor = int(offsets[-1]), surfels.anchor
-    rows = np.empty((kernels.ROWS, new), np.float32)
+    firsts = np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
+    new, anchor = int(firsts[-1]), surfels.anchor
+    rows = np.empty((ROWS, new), np.float32)
     whole = rows.view(np.int32)
 
     def make(start: int, stop: int) -> None:
         kernels.new_surfels(
-            start, stop, pending, counts, offsets, surface, color, alpha, transform, frame_id, anchor, rows, whole
+            start, stop, pending, counts, firsts, surface, color, alpha, transform, frame_id, anchor, rows, whole
         )
 
     run_ranges(camera.height, make)
     pages.add(rows)
     counted = FusionCounts(new, tidy(surfels, frame_id, config))
-    return counted, SurfelView(T_world_camera, camera, seen, image, config.stable_confidence)
+    return counted, as_view(shown, values, T_world_camera, camera, config.stable_confidence)
 
 
 def tidy(surfels: SurfelMap, frame_id: int, config: FusionConfig) -> int:
@@ -152,6 +155,9 @@ def tidy(surfels: SurfelMap, frame_id: int, config: FusionConfig) -> int:
     if frame_id % config.clean_interval != 0:
         return 0
     pages = surfels.pages
-    late = frame_id - pages.probation.astype(np.int64) > config.unstable_frames
-    slots = np.flatnonzero((pages.counts > 0) & (late | (pages.dirty > 0)))
+    late, dirty = (
+        pages.on_probation_since(frame_id - config.unstable_frames),
+        np.flatnonzero(pages.dirty.view(np.bool_)),
+    )
+    slots = np.union1d(late, dirty)
     return surfels.clean(slots, frame_id, config.unstable_frames, config.stable_confidence)

@@ -1,61 +1,38 @@
 """Compiled kernels of the surfel map.
 
-The map is pages of `PAGE` surfels in one flat array: `pool` as float32, `whole` the same bytes as int32. Page `slot`
-begins at slot * SPAN; its row r, one number per surfel, is at r * STRIDE from there. Surfel k of it has the number
-slot * PAGE + k.
+The map is pages of surfels in one flat array (:mod:`~.storage.kernels`): `pool` as float32, `whole` the same bytes as
+int32.
 
 Work is split by pages or by image rows. Threads never write the same element: each splats into a depth buffer of its
 own, and a surfel that won a pixel is the only one there. What
 needs surfels goes through the map page by page, because neighbours in a page are neighbours in the image, while the
-surfels of neighbouring pixels lie anywhere; what needs several surfels around a pixel reads the model image.
+surfels of neighbouring pixels lie anywhere; so do the rows of what is seen, which a map (H, W) leads to from a pixel.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from scanweld.parallel import kernel
-
-PAGE = 256
-"""Surfels of a page."""
-
-STRIDE = PAGE + 16
-"""Distance of a page's rows: 17 cache lines, so that equal places of different rows lie in different cache sets."""
-
-ROWS = 14
-"""Numbers per surfel: position, normal, confidence, radius, colour, created, last seen, anchor."""
-
-Y, Z, NX, NY, NZ, CONFIDENCE, RADIUS, RED, GREEN, BLUE, CREATED, LAST_SEEN, ANCHOR = (
-    np.uint64(row * STRIDE) for row in range(1, ROWS)
+from scanweld.mapping.storage.kernels import (
+    BLUE,
+    CONFIDENCE,
+    GREEN,
+    LAST_SEEN,
+    NX,
+    NY,
+    NZ,
+    PAGE,
+    RADIUS,
+    RED,
+    SPAN,
+    STRIDE,
+    Y,
+    Z,
 )
-"""Distances of the rows from the first, x."""
-
-SPAN = ROWS * STRIDE
-"""Distance of the pages."""
+from scanweld.parallel import kernel
 
 EMPTY = np.int64(0x7FFFFFFFFFFFFFFF)
 """A pixel of the depth buffer that nothing landed in."""
-
-
-@kernel
-def cull_pages(counts, boxes, planes, slots):
-    """List the pages that are not wholly outside one of the planes (6, 4) n . x + d >= 0; returns how many.
-
-    counts (P,) int32 surfels of each page; boxes (P, 6) float32 their lower and upper corners; slots (P,) int32: the
-    list.
-    """
-    listed = 0
-    for slot in range(len(counts)):
-        inside = counts[slot] > 0
-        for k in range(planes.shape[0]):
-            farthest = planes[k, 3]
-            for axis in range(3):
-                normal = planes[k, axis]
-                farthest += max(normal * boxes[slot, axis], normal * boxes[slot, 3 + axis])
-            inside = inside & (farthest >= 0)
-        slots[listed] = slot
-        listed += 1 if inside else 0
-    return listed
 
 
 @kernel
@@ -104,22 +81,61 @@ def splat_pages(start, stop, slots, counts, pool, transform, intrinsics, stable,
 
 
 @kernel
-def resolve(start, stop, buffers, index_map, row_counts):
+def resolve(start, stop, buffers, numbers):
     """Rows start..stop of the index map: the nearest surfel over all threads' buffers (T, H, W), -1 where none.
 
     The buffers are empty afterwards.
     """
     for v in range(start, stop):
-        seen = 0
         for u in range(buffers.shape[2]):
             key = buffers[0, v, u]
             buffers[0, v, u] = EMPTY
             for t in range(1, buffers.shape[0]):
                 key = min(key, buffers[t, v, u])
                 buffers[t, v, u] = EMPTY
-            index_map[v, u] = np.int32(key & np.int64(0xFFFFFFFF)) if key != EMPTY else np.int32(-1)
-            seen += 1 if key != EMPTY else 0
-        row_counts[v] = seen
+            numbers[v, u] = np.int32(key & np.int64(0xFFFFFFFF)) if key != EMPTY else np.int32(-1)
+
+
+@kernel
+def list_winners(start, stop, slots, counts, numbers, landed, places, won):
+    """List the surfels of pages slots[start:stop] that won a pixel: won (P,) int32 of each page.
+
+    numbers (H * W,) int32: see `resolve`; landed (P * PAGE,): see `splat_pages`. Those of page s are from s * PAGE on
+    in places (P * PAGE,) uint8, the surfel's place in its page, and their pixels in `landed` from then on.
+    """
+    for s in range(start, stop):
+        first, count, number = np.uint64(s) * np.uint64(PAGE), np.uint64(counts[slots[s]]), np.int32(slots[s] * PAGE)
+        n = first
+        for k in range(count):  # no branch: which surfels win is hard to predict
+            pixel = landed[first + k]
+            places[n], landed[n] = np.uint8(k), pixel
+            n += np.uint64((pixel >= 0) & (numbers[np.uint64(max(pixel, np.int32(0)))] == number + np.int32(k)))
+        won[s] = n - first
+
+
+@kernel
+def show_page(won, first, base, row, places, landed, pool, rows, values):
+    """Write the `won` surfels of a page that are seen to values (8, N) float32, from `row` on.
+
+    They have position, normal, confidence and luminance (ITU-R BT.601). rows (H * W,) int32: which row is at a pixel.
+    """
+    for n in range(won):
+        rows[np.uint64(landed[first + n])] = np.int32(row + n)
+    for n in range(won):
+        i, j = base + np.uint64(places[first + n]), row + n
+        values[0, j], values[1, j], values[2, j] = pool[i], pool[i + Y], pool[i + Z]
+        values[3, j], values[4, j], values[5, j] = pool[i + NX], pool[i + NY], pool[i + NZ]
+        values[6, j] = pool[i + CONFIDENCE]
+        red, green, blue = pool[i + RED], pool[i + GREEN], pool[i + BLUE]
+        values[7, j] = np.float32(0.299) * red + np.float32(0.587) * green + np.float32(0.114) * blue
+
+
+@kernel
+def show_pages(start, stop, slots, places, landed, won, offsets, pool, rows, values):
+    """Write the surfels of pages slots[start:stop] that are seen: see `show_page`; offsets (P + 1,): their rows."""
+    for s in range(start, stop):
+        first, base = np.uint64(s) * np.uint64(PAGE), np.uint64(slots[s]) * np.uint64(SPAN)
+        show_page(np.uint64(won[s]), first, base, np.uint64(offsets[s]), places, landed, pool, rows, values)
 
 
 @kernel
@@ -131,51 +147,6 @@ def copy_eight(source, i, target, j):
     target[j], target[j + np.uint64(1)], target[j + np.uint64(2)], target[j + np.uint64(3)] = a, b, c, d
     target[j + np.uint64(4)], target[j + np.uint64(5)] = e, f
     target[j + np.uint64(6)], target[j + np.uint64(7)] = g, h
-
-
-@kernel
-def shade_pages(start, stop, slots, counts, landed, index_map, pool, image):
-    """Write what the surfels of pages slots[start:stop] that won a pixel are to the model image (H * W * 8,).
-
-    A pixel has position, normal, confidence and luminance (ITU-R BT.601). index_map (H * W,) int32; landed (P * PAGE,)
-    int32: see `splat_pages`; it becomes -1 for those that did not win their pixel.
-    """
-    tile, winners, pixels = np.empty(8 * PAGE, np.float32), np.empty(PAGE, np.int32), np.empty(PAGE, np.int32)
-    for s in range(start, stop):
-        slot, first, count = np.uint64(slots[s]), np.uint64(s) * np.uint64(PAGE), np.uint64(counts[slots[s]])
-        base, number = slot * np.uint64(SPAN), np.int32(slots[s]) * np.int32(PAGE)
-        for k in range(count):
-            red, green, blue = pool[base + k + RED], pool[base + k + GREEN], pool[base + k + BLUE]
-            j = k * np.uint64(8)
-            tile[j], tile[j + np.uint64(1)], tile[j + np.uint64(2)] = (
-                pool[base + k],
-                pool[base + k + Y],
-                pool[base + k + Z],
-            )
-            tile[j + np.uint64(3)], tile[j + np.uint64(4)] = pool[base + k + NX], pool[base + k + NY]
-            tile[j + np.uint64(5)], tile[j + np.uint64(6)] = pool[base + k + NZ], pool[base + k + CONFIDENCE]
-            tile[j + np.uint64(7)] = np.float32(0.299) * red + np.float32(0.587) * green + np.float32(0.114) * blue
-        won = np.uint64(0)
-        for k in range(count):  # no branch: which surfels win is hard to predict
-            pixel = landed[first + k]
-            winners[won], pixels[won] = np.int32(k), pixel
-            wins = (pixel >= 0) & (index_map[np.uint64(max(pixel, np.int32(0)))] == number + np.int32(k))
-            landed[first + k] = pixel if wins else np.int32(-1)
-            won += np.uint64(wins)
-        for n in range(won):
-            copy_eight(tile, np.uint64(winners[n]) * np.uint64(8), image, np.uint64(pixels[n]) * np.uint64(8))
-
-
-@kernel
-def list_pixels(start, stop, index_map, offsets, pixels):
-    """Write the filled pixels of index-map rows start..stop to the places that `offsets` (H,) gives out."""
-    width = index_map.shape[1]
-    for v in range(start, stop):
-        k = offsets[v]
-        for u in range(width):
-            if index_map[v, u] >= 0:
-                pixels[k] = v * width + u
-                k += 1
 
 
 @kernel
@@ -205,80 +176,46 @@ def is_seen_through(u, v, x, y, z, gate, margin, surface, width, height, transfo
     return depth < nearest - max(margin, np.float32(2) * gate)
 
 
+SURFACE, ALPHA, COLOR = np.uint64(0), np.uint64(8 * STRIDE), np.uint64(9 * STRIDE)
+"""Where the rows begin that `read_pixels` fills: eight of the surface, the weight, three of the colour."""
+
+SIGMA = np.uint64(6 * STRIDE)
+"""The row with one over the noise, zero where there is no surface."""
+
+
 @kernel
-def merge_pages(
-    start, stop, slots, counts, landed, index_map, surface, color, alpha, transform, parameters, width, height,
-    frame_id, pool, whole, dirty, merged,
-):  # fmt: skip
-    """Merge the surfels of pages slots[start:stop] with the pixels that they won: p <- (w p + alpha q) / (w + alpha).
+def read_pixels(count, won, first, places, landed, surface, color, alpha, seen):
+    """Read what the `won` pixels of a page measure into rows seen (12 * STRIDE,), at their surfels' places.
 
-    The same for normal and colour (Keller et al. 2013, eq. 5-8). A surfel that is seen through loses the weight of the
-    pixel, one that a pixel of negative weight, which moves, lies on all but that of one measurement.
-
-    landed, index_map: see `shade_pages`; surface (H * W * 8,), see `SurfaceLevel.surface`; color (H * W * 3,) uint8;
-    alpha (H * W,) float32 weight of the measurement; transform (3, 4) camera -> world; parameters: see `fusion.fuse`;
-    dirty (P,) uint8: pages with a surfel that lost confidence; merged (H * W + 1,) uint8: pixels whose measurement is
-    in the map; the last is written in vain.
+    The processor waits for memory, for as many pixels at once as it can see ahead: first come loops so short that it
+    sees many.
     """
-    one, zero, margin = np.float32(1), np.float32(0), parameters[3]
-    seen, rows = np.zeros(8 * PAGE, np.float32), np.zeros(4 * STRIDE, np.float32)
-    verdicts, winners = np.empty(PAGE, np.int32), np.empty(PAGE, np.int32)
-    for s in range(start, stop):
-        slot, first, count = np.uint64(slots[s]), np.uint64(s) * np.uint64(PAGE), np.uint64(counts[slots[s]])
-        base, number = slot * np.uint64(SPAN), np.int32(slots[s]) * np.int32(PAGE)
-        won = np.uint64(0)
-        for k in range(count):  # no branch: which surfels won a pixel is hard to predict
-            pixel = landed[first + k]
-            winners[won] = np.int32(k)
-            wins = (pixel >= 0) & (index_map[np.uint64(max(pixel, np.int32(0)))] == number + np.int32(k))
-            landed[first + k] = pixel if wins else np.int32(-1)
-            won += np.uint64(wins)
-        # What the pixels say, into rows: a loop so short that the processor waits for many pixels at once.
-        for n in range(won):
-            place = np.uint64(winners[n])
-            pixel = np.uint64(landed[first + place])
-            copy_eight(surface, pixel * np.uint64(8), seen, place * np.uint64(8))
-            j = pixel * np.uint64(3)
-            red, green, blue = color[j], color[j + np.uint64(1)], color[j + np.uint64(2)]
-            rows[place], rows[place + np.uint64(STRIDE)] = np.float32(red), np.float32(green)
-            rows[place + np.uint64(2 * STRIDE)], rows[place + np.uint64(3 * STRIDE)] = np.float32(blue), alpha[pixel]
-        merge_page(count, base, first, landed, seen, rows, transform, parameters, pool, verdicts)
-        nowhere = np.uint64(len(merged) - 1)
-        disagree = demoted = False
-        for k in range(count):
-            confirmed = (verdicts[k] == 1) & (rows[k + np.uint64(3 * STRIDE)] > zero)
-            whole[base + LAST_SEEN + k] = frame_id if confirmed else whole[base + LAST_SEEN + k]
-            disagree |= verdicts[k] == 2
-        for n in range(won):
-            place = np.uint64(winners[n])
-            merged[np.uint64(landed[first + place]) if verdicts[place] == 1 else nowhere] = 1
-            demoted |= (verdicts[place] == 1) & (rows[place + np.uint64(3 * STRIDE)] < zero)
-        if not (disagree | demoted):
-            continue
-        for k in range(count):
-            if verdicts[k] == 0:
-                continue
-            pixel, i = np.uint64(landed[first + k]), base + k
-            if verdicts[k] == 1:
-                if alpha[pixel] < zero:
-                    pool[i + CONFIDENCE] = min(pool[i + CONFIDENCE], one)
-                    dirty[slot] = 1
-                continue
-            v, u = np.int64(pixel) // width, np.int64(pixel) % width
-            gate = max(parameters[0] / surface[pixel * np.uint64(8) + np.uint64(6)], parameters[1])
-            x, y, z = pool[i], pool[i + Y], pool[i + Z]
-            if is_seen_through(u, v, x, y, z, gate, margin, surface, width, height, transform):
-                # Never below zero: a surfel that is confirmed after all takes the new measurement's place.
-                pool[i + CONFIDENCE] = max(pool[i + CONFIDENCE] - abs(alpha[pixel]), zero)
-                dirty[slot] = 1
+    for k in range(count):
+        seen[SIGMA + k] = np.float32(0)
+    for n in range(won):
+        k, j = np.uint64(places[first + n]), np.uint64(landed[first + n]) * np.uint64(8)
+        seen[SIGMA + k] = surface[j + np.uint64(6)]
+    for n in range(won):
+        seen[ALPHA + np.uint64(places[first + n])] = alpha[np.uint64(landed[first + n])]
+    for n in range(won):
+        k, j = COLOR + np.uint64(places[first + n]), np.uint64(landed[first + n]) * np.uint64(3)
+        seen[k], seen[k + np.uint64(STRIDE)] = np.float32(color[j]), np.float32(color[j + np.uint64(1)])
+        seen[k + np.uint64(2 * STRIDE)] = np.float32(color[j + np.uint64(2)])
+    for n in range(won):
+        k, j = np.uint64(places[first + n]), np.uint64(landed[first + n]) * np.uint64(8)
+        a, b, c, d = surface[j], surface[j + np.uint64(1)], surface[j + np.uint64(2)], surface[j + np.uint64(3)]
+        e, f, g = surface[j + np.uint64(4)], surface[j + np.uint64(5)], surface[j + np.uint64(7)]
+        seen[k], seen[k + np.uint64(STRIDE)], seen[k + np.uint64(2 * STRIDE)] = a, b, c
+        seen[k + np.uint64(3 * STRIDE)], seen[k + np.uint64(4 * STRIDE)] = d, e
+        seen[k + np.uint64(5 * STRIDE)], seen[k + np.uint64(7 * STRIDE)] = f, g
 
 
 @kernel
-def merge_page(count, base, first, landed, seen, rows, transform, parameters, pool, verdicts):
-    """Merge surfels base.. of the pool with the pixels that they landed in; a vectorised loop, all masks.
+def merge_page(count, base, seen, transform, parameters, frame_id, pool, whole, verdicts):
+    """Merge surfels base.. of the pool with what their pixels measure; a vectorised loop, all masks.
 
-    seen (PAGE * 8,): the pixels' surfaces; rows (4 * STRIDE,): their colours (3) and weights. verdicts (PAGE,) int32: 1
-    where they agree, 2 where they do not, 0 where there is nothing to agree with.
+    seen: see `read_pixels`. verdicts (PAGE,) int32: 1 where they agree, 2 where they do not, 0 where there is nothing
+    to agree with.
     """
     one, zero = np.float32(1), np.float32(0)
     sigmas, floor, min_cosine, most = parameters[0], parameters[1], parameters[2], parameters[5]
@@ -286,12 +223,12 @@ def merge_page(count, base, first, landed, seen, rows, transform, parameters, po
     r10, r11, r12, t1 = transform[1, 0], transform[1, 1], transform[1, 2], transform[1, 3]
     r20, r21, r22, t2 = transform[2, 0], transform[2, 1], transform[2, 2], transform[2, 3]
     for k in range(count):
-        j = k * np.uint64(8)
-        x, y, z = seen[j], seen[j + np.uint64(1)], seen[j + np.uint64(2)]
-        a, b, c = seen[j + np.uint64(3)], seen[j + np.uint64(4)], seen[j + np.uint64(5)]
-        weight, radius = seen[j + np.uint64(6)], seen[j + np.uint64(7)]
-        red, green, blue = rows[k], rows[k + np.uint64(STRIDE)], rows[k + np.uint64(2 * STRIDE)]
-        more, here = rows[k + np.uint64(3 * STRIDE)], (landed[first + k] >= 0) & (weight > zero)
+        x, y, z = seen[k], seen[k + np.uint64(STRIDE)], seen[k + np.uint64(2 * STRIDE)]
+        a, b, c = seen[k + np.uint64(3 * STRIDE)], seen[k + np.uint64(4 * STRIDE)], seen[k + np.uint64(5 * STRIDE)]
+        weight, radius = seen[SIGMA + k], seen[k + np.uint64(7 * STRIDE)]
+        red, green = seen[COLOR + k], seen[COLOR + k + np.uint64(STRIDE)]
+        blue = seen[COLOR + k + np.uint64(2 * STRIDE)]
+        more, here = seen[ALPHA + k], weight > zero
         qx = r00 * x + r01 * y + r02 * z + t0
         qy = r10 * x + r11 * y + r12 * z + t1
         qz = r20 * x + r21 * y + r22 * z + t2
@@ -318,17 +255,65 @@ def merge_page(count, base, first, landed, seen, rows, transform, parameters, po
         pool[i + CONFIDENCE] = min(confidence + more, most) if moved else confidence
         # The finest view of a surface sets how large its surfels are; neighbours may be two of its pixels apart.
         pool[i + RADIUS] = min(width, np.float32(2) * radius) if moved else width
-        pool[i + RED] = keep * pool[i + RED] + add * red
-        pool[i + GREEN] = keep * pool[i + GREEN] + add * green
-        pool[i + BLUE] = keep * pool[i + BLUE] + add * blue
+        pool[i + RED] = keep * pool[i + RED] + add * red if moved else pool[i + RED]
+        pool[i + GREEN] = keep * pool[i + GREEN] + add * green if moved else pool[i + GREEN]
+        pool[i + BLUE] = keep * pool[i + BLUE] + add * blue if moved else pool[i + BLUE]
+        whole[i + LAST_SEEN] = frame_id if moved else whole[i + LAST_SEEN]
+
+
+@kernel
+def merge_pages(
+    start, stop, slots, counts, places, landed, won, offsets, surface, color, alpha, transform, parameters, width,
+    height, frame_id, pool, whole, dirty, merged, rows, values,
+):  # fmt: skip
+    """Merge the surfels of pages slots[start:stop] with the pixels that they won: p <- (w p + alpha q) / (w + alpha).
+
+    The same for normal and colour (Keller et al. 2013, eq. 5-8). A surfel that is seen through loses the weight of the
+    pixel, one that a pixel of negative weight, which moves, lies on all but that of one measurement. What they have
+    become is written to `rows` and `values`: see `show_pages`.
+
+    places, landed, won: see `list_winners`; surface (H * W * 8,), see `SurfaceLevel.surface`; color (H * W * 3,) uint8;
+    alpha (H * W,) float32 weight of the measurement; transform (3, 4) camera -> world; parameters: see `fusion.fuse`;
+    dirty (P,) uint8: pages with a surfel that lost confidence; merged (H * W,) uint8: pixels whose measurement is in
+    the map.
+    """
+    one, zero, margin = np.float32(1), np.float32(0), parameters[3]
+    seen, verdicts = np.zeros(12 * STRIDE, np.float32), np.empty(PAGE, np.int32)
+    for s in range(start, stop):
+        if won[s] == 0:
+            continue
+        slot, first, count = np.uint64(slots[s]), np.uint64(s) * np.uint64(PAGE), np.uint64(counts[slots[s]])
+        base, listed = slot * np.uint64(SPAN), np.uint64(won[s])
+        read_pixels(count, listed, first, places, landed, surface, color, alpha, seen)
+        merge_page(count, base, seen, transform, parameters, frame_id, pool, whole, verdicts)
+        demoted = False
+        for k in range(count):
+            demoted |= (verdicts[k] == 2) | ((verdicts[k] == 1) & (seen[ALPHA + k] < zero))
+        for n in range(listed):
+            merged[np.uint64(landed[first + n])] = verdicts[np.uint64(places[first + n])] == 1
+        for n in range(listed if demoted else np.uint64(0)):
+            place, pixel = np.uint64(places[first + n]), np.uint64(landed[first + n])
+            i, weight = base + place, alpha[pixel]
+            if (verdicts[place] == 1) & (weight < zero):
+                pool[i + CONFIDENCE] = min(pool[i + CONFIDENCE], one)
+                dirty[slot] = 1
+            if verdicts[place] == 2:
+                v, u = np.int64(pixel) // width, np.int64(pixel) % width
+                gate = max(parameters[0] / surface[pixel * np.uint64(8) + np.uint64(6)], parameters[1])
+                x, y, z = pool[i], pool[i + Y], pool[i + Z]
+                if is_seen_through(u, v, x, y, z, gate, margin, surface, width, height, transform):
+                    # Never below zero: a surfel that is confirmed after all takes the new measurement's place.
+                    pool[i + CONFIDENCE] = max(pool[i + CONFIDENCE] - abs(weight), zero)
+                    dirty[slot] = 1
+        show_page(listed, first, base, np.uint64(offsets[s]), places, landed, pool, rows, values)
 
 
 @kernel
 def cover_row(count, v, columns, seen, others, asked, transform, intrinsics, parameters, covered):
     """Mark pixels of row v whose measurement a neighbour's surfel covers; a vectorised loop, all masks.
 
-    columns (W,) int32: the pixels; seen, others (W * 8,): their surfaces, and the neighbours' model pixels; asked (W,)
-    int32: 1 where there is such a neighbour; covered (W,) int32.
+    columns (W,) int32: the pixels; seen (W * 8,): their surfaces; asked (W,) int32: the rows of the neighbours'
+    surfels, -1 where there is none; others (6, W): their positions and normals; covered (W,) int32.
     """
     sigmas, floor, min_cosine, spread = parameters[0], parameters[1], parameters[2], parameters[4]
     r00, r01, r02, t0 = transform[0, 0], transform[0, 1], transform[0, 2], transform[0, 3]
@@ -342,8 +327,7 @@ def cover_row(count, v, columns, seen, others, asked, transform, intrinsics, par
         a, b, c = seen[j + np.uint64(3)], seen[j + np.uint64(4)], seen[j + np.uint64(5)]
         gate = max(sigmas / seen[j + np.uint64(6)], floor)
         reach = np.float32(4) * seen[j + np.uint64(7)] + gate
-        px, py, pz = others[j], others[j + np.uint64(1)], others[j + np.uint64(2)]
-        mx, my, mz = others[j + np.uint64(3)], others[j + np.uint64(4)], others[j + np.uint64(5)]
+        px, py, pz, mx, my, mz = others[0, n], others[1, n], others[2, n], others[3, n], others[4, n], others[5, n]
         dx, dy, dz = px - t0, py - t1, pz - t2
         ex, ey = dx - (r00 * x + r01 * y + r02 * z), dy - (r10 * x + r11 * y + r12 * z)
         ez = dz - (r20 * x + r21 * y + r22 * z)
@@ -352,24 +336,22 @@ def cover_row(count, v, columns, seen, others, asked, transform, intrinsics, par
         right = fx * (r00 * dx + r10 * dy + r20 * dz) - (np.float32(columns[n]) - cx) * zc
         down = fy * (r01 * dx + r11 * dy + r21 * dz) - below * zc
         near = right * right + down * down < spread * spread * zc * zc
-        near = near & (asked[n] > 0) & agrees(ex, ey, ez, mx, my, mz, nx, ny, nz, gate, reach, min_cosine)
+        near = near & (asked[n] >= 0) & agrees(ex, ey, ez, mx, my, mz, nx, ny, nz, gate, reach, min_cosine)
         covered[n] = np.int32(1) if near else np.int32(0)
 
 
 @kernel
-def cover_rows(
-    start, stop, index_map, image, merged, surface, moving, transform, intrinsics, parameters, pending, counts
-):
+def cover_rows(start, stop, rows, values, merged, surface, moving, transform, intrinsics, parameters, pending, counts):
     """List the pixels of rows start..stop that need a surfel: what they measure is not in the map.
 
-    Neither the pixel's own surfel took it in nor is a neighbour's surfel near enough; nor does it move. image
-    (H * W * 8,): see `shade_pages`; surface (H * W * 8,); moving (H, W) bool, or of another height where nothing moves;
+    Neither the pixel's own surfel took it in nor is a neighbour's surfel near enough; nor does it move. rows (H, W),
+    values (8, N): see `show_page`; surface (H * W * 8,); moving (H, W) bool, or of another height where nothing moves;
     pending (H, W) int32 columns, counts (H,) int32 how many of each row; see `merge_pages`.
     """
-    height, width = index_map.shape
+    height, width = rows.shape
     masked = moving.shape[0] == height
     columns, asked, covered = np.empty(width, np.int32), np.empty(width, np.int32), np.empty(width, np.int32)
-    seen, others = np.empty(8 * width, np.float32), np.empty(8 * width, np.float32)
+    seen, others = np.empty(8 * width, np.float32), np.empty((6, width), np.float32)
     for v in range(start, stop):
         count, first = np.uint64(0), np.uint64(v) * np.uint64(width)
         for u in range(np.uint64(width)):
@@ -387,10 +369,12 @@ def cover_rows(
                 continue
             for n in range(count):
                 u = columns[n]
-                beside = np.uint64(min(max(u + du, 0), width - 1))
-                number = index_map[v + dv, beside]
-                asked[n] = 1 if (number >= 0) & (number != index_map[v, np.uint64(u)]) else 0
-                copy_eight(image, (np.uint64((v + dv) * width) + beside) * np.uint64(8), others, n * np.uint64(8))
+                row = rows[v + dv, np.uint64(min(max(u + du, 0), width - 1))]
+                asked[n] = row if row != rows[v, np.uint64(u)] else np.int32(-1)
+            for n in range(count):
+                row = np.uint64(max(asked[n], np.int32(0)))
+                others[0, n], others[1, n], others[2, n] = values[0, row], values[1, row], values[2, row]
+                others[3, n], others[4, n], others[5, n] = values[3, row], values[4, row], values[5, row]
             cover_row(count, v, columns, seen, others, asked, transform, intrinsics, parameters, covered)
             left = np.uint64(0)
             for n in range(count):
@@ -420,81 +404,6 @@ def new_surfels(start, stop, pending, counts, offsets, surface, color, alpha, tr
                 rows[8 + axis, i] = np.float32(color[v, u, axis])
             rows[6, i], rows[7, i] = alpha[v, u], s[7]
             whole[11, i], whole[12, i], whole[13, i] = frame_id, frame_id, anchor
-
-
-@kernel
-def find_cell(key, keys):
-    """Place of a key in a hash table (2^n,) int64 with linear probing, or the free place (-1) where it belongs."""
-    mask = np.uint64(len(keys) - 1)
-    k = (np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)) >> np.uint64(20) & mask
-    while (keys[k] != key) & (keys[k] >= 0):
-        k = (k + np.uint64(1)) & mask
-    return k
-
-
-@kernel
-def deposit(first, rows, per_cell, free, num_free, room, counts, boxes, cells, probation, keys, tails, pool, numbers):
-    """Put surfels rows[:, first:] (ROWS, N) into pages of their cells, until pages or room in the table run out.
-
-    per_cell: cells per metre; free (F,) int32: slots of free pages, the last `num_free` first; room: keys that may
-    still come into the table; counts, boxes, cells, probation: see `PagePool`; keys (2^n,) int64, -1 where free, tails
-    (2^n,) int32: the table of cells and the page that each fills; numbers (N,) int32: the surfels' numbers. Returns how
-    far it came, the free pages and the room that are left.
-    """
-    for k in range(first, rows.shape[1]):
-        x, y, z = rows[0, k], rows[1, k], rows[2, k]
-        key = np.int64(np.floor(x * per_cell)) + np.int64(1 << 20)
-        key = (key << np.int64(21)) | (np.int64(np.floor(y * per_cell)) + np.int64(1 << 20))
-        key = (key << np.int64(21)) | (np.int64(np.floor(z * per_cell)) + np.int64(1 << 20))
-        entry = find_cell(key, keys)
-        if keys[entry] < 0:
-            if room == 0:
-                return k, num_free, room
-            keys[entry], tails[entry] = key, -1
-            room -= 1
-        slot = tails[entry]
-        # A page that was released since, and may belong to another cell by now, is no longer this cell's.
-        if slot < 0 or (cells[slot] != key) | (counts[slot] == PAGE):
-            if num_free == 0:
-                return k, num_free, room
-            num_free -= 1
-            slot = free[num_free]
-            tails[entry], cells[slot], counts[slot] = slot, key, 0
-            probation[slot] = 0x7FFFFFFF
-            for axis in range(3):
-                boxes[slot, axis], boxes[slot, 3 + axis] = np.float32(1e9), np.float32(-1e9)
-        i = np.uint64(slot) * np.uint64(SPAN) + np.uint64(counts[slot])
-        for row in range(np.uint64(ROWS)):
-            pool[i + row * np.uint64(STRIDE)] = rows[row, k]
-        for axis in range(3):
-            boxes[slot, axis] = min(boxes[slot, axis], rows[axis, k])
-            boxes[slot, 3 + axis] = max(boxes[slot, 3 + axis], rows[axis, k])
-        numbers[k] = slot * PAGE + counts[slot]
-        counts[slot] += 1
-    return rows.shape[1], num_free, room
-
-
-@kernel
-def clean_pages(start, stop, slots, frame_id, unstable_frames, stable, pool, whole, counts, probation):
-    """Drop from pages slots[start:stop] what stayed unstable for too long or has no confidence left.
-
-    probation (P,) int32: the first frame of what is still unstable.
-    """
-    for s in range(start, stop):
-        slot = slots[s]
-        base = np.uint64(slot) * np.uint64(SPAN)
-        kept, earliest = np.uint64(0), 0x7FFFFFFF
-        for k in range(np.uint64(counts[slot])):
-            confidence, created = pool[base + CONFIDENCE + k], whole[base + CREATED + k]
-            if (confidence <= 0) | ((frame_id - created > unstable_frames) & (confidence < stable)):
-                continue
-            if confidence < stable:
-                earliest = min(earliest, created)
-            if kept < k:
-                for row in range(np.uint64(ROWS)):
-                    whole[base + row * np.uint64(STRIDE) + kept] = whole[base + row * np.uint64(STRIDE) + k]
-            kept += np.uint64(1)
-        counts[slot], probation[slot] = kept, earliest
 
 
 @kernel

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from scanweld.arrays import Bool, Float32, Float64
+from scanweld.arrays import Bool, Float64
 from scanweld.geometry import se3
 from scanweld.geometry.camera import PinholeCamera
 from scanweld.geometry.depth import SurfacePyramid
 from scanweld.geometry.views import MapCorrection, ModelView
 from scanweld.mapping.fusion import FusionConfig, FusionCounts, fuse
 from scanweld.mapping.merging import merge_doubled
-from scanweld.mapping.rendering import DepthBuffers, SurfelView, find_candidates, render_model_view
+from scanweld.mapping.rendering import DepthBuffers, find_candidates, render_model_view
+from scanweld.mapping.storage.pages import MapConfig
 from scanweld.mapping.surfel_map import SurfelMap
 
 
@@ -22,12 +23,12 @@ class SurfelMapper:
     expected close by.
     """
 
-    def __init__(self, config: FusionConfig | None = None) -> None:
+    def __init__(self, config: FusionConfig | None = None, storage: MapConfig | None = None) -> None:
         self.config = config or FusionConfig()
-        self.map = SurfelMap()
+        self.map = SurfelMap(config=storage)
         self._frames_fused = 0
         self._depth_buffers = DepthBuffers()
-        self._fused: SurfelView | None = None
+        self._fused: ModelView | None = None
         self._reach_m = REACH_M
 
     def view(self, T_world_camera: Float64, camera: PinholeCamera) -> ModelView:
@@ -59,26 +60,25 @@ class SurfelMapper:
 
     def apply(self, correction: MapCorrection) -> None:
         """Move surfels with their keyframes, and fuse the layers that this brings together."""
-        self._merge(_moved(self.map, correction))
+        self.map.apply_correction(correction)
+        self._merge(correction)
 
     def fresh(self) -> SurfelMapper:
         """Return a mapper like this one with an empty map; its frames are numbered on from those of this one."""
-        other = SurfelMapper(self.config)
+        other = SurfelMapper(self.config, self.map.pages.config)
         other._frames_fused, other._reach_m = self._frames_fused, self._reach_m
         return other
 
     def take_in(self, other: SurfelMapper, correction: MapCorrection) -> None:
         """Add the map of another mapper, moved with its keyframes, and fuse the layers that this brings together."""
-        moved = _moved(other.map, correction)
-        places = self.map.take_in(other.map)
+        other.map.apply_correction(correction)
+        self.map.take_in(other.map)
         self._frames_fused = max(self._frames_fused, other._frames_fused)
         self._reach_m = max(self._reach_m, other._reach_m)
-        moved_m = np.zeros((3, len(self.map)), np.float32)
-        moved_m[:, places] = moved
-        self._merge(moved_m)
+        self._merge(correction)
 
-    def _merge(self, moved_m: Float32) -> None:
-        merge_doubled(self.map, moved_m, self.config.max_confidence, self.config.merging)
+    def _merge(self, correction: MapCorrection) -> None:
+        merge_doubled(self.map, correction, self.config.max_confidence, self.config.merging)
         self._fused = None
 
 
@@ -90,13 +90,6 @@ def _moved_share(view: ModelView, T_world_camera: Float64, camera: PinholeCamera
     shift, turn = float(np.linalg.norm(motion[:3, 3])), float(se3.rotation_angle_rad(motion))
     # At the corners of the image a turn moves pixels by half as much again as in the middle.
     return max(camera.fx, camera.fy) * (1.5 * turn + shift / TYPICAL_M) / camera.width
-
-
-def _moved(surfels: SurfelMap, correction: MapCorrection) -> Float32:
-    """Apply a correction; returns how far each surfel moved (3, N) [m]."""
-    before = surfels.positions_m
-    surfels.apply_correction(correction)
-    return np.asarray(surfels.positions_m - before)
 
 
 REACH_M, FURTHER = 12.0, 1.5

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -12,7 +12,7 @@ from scanweld.arrays import Float32, Float64, Int32, Int64, UInt8
 from scanweld.geometry import se3
 from scanweld.geometry.camera import PinholeCamera
 from scanweld.geometry.depth import intrinsics_array
-from scanweld.geometry.views import ModelRows, ModelView
+from scanweld.geometry.views import ModelView
 from scanweld.mapping import kernels
 from scanweld.mapping.surfel_map import SurfelMap
 from scanweld.parallel import get_num_threads, run_ranges
@@ -71,20 +71,28 @@ class DepthBuffers:
 
 @dataclass(frozen=True, slots=True)
 class IndexMap:
-    """Which surfel is seen at each pixel from a pose.
+    """Which surfel is seen at each pixel from a pose, and which surfels of each page are seen.
 
     Attributes
     ----------
     numbers : (H, W) int32, number of the surfel, -1 where there is none
-    row_counts : (H,) int64, filled pixels of each row
     slots : (P,) int32, the pages that were looked at
-    landed : (P * PAGE,) int32, the pixel of each of their surfels, -1 for none
+    won : (P,) int32, how many surfels of each are seen; those of page s are from s * PAGE on in the next two
+    places : (P * PAGE,) uint8, where they are in their page
+    pixels : (P * PAGE,) int32, where they are seen, row-major
     """
 
     numbers: Int32
-    row_counts: Int64
     slots: Int32
-    landed: Int32
+    won: Int32
+    places: UInt8
+    pixels: Int32
+
+    def room(self) -> tuple[Int64, Int32, Float32]:
+        """Return what a view is written to: offsets (P + 1,), the row at which the surfels of each page begin, rows
+        (H, W), -1 so far, and values (8, N), undefined so far; see the kernel `show_pages`."""
+        offsets = np.concatenate([[0], np.cumsum(self.won, dtype=np.int64)])
+        return offsets, np.full(self.numbers.shape, -1, np.int32), np.empty((8, int(offsets[-1])), np.float32)
 
 
 def render_index_map(
@@ -114,22 +122,15 @@ def render_index_map(
             )  # fmt: skip
 
     run_ranges(len(parts), splat)
-    numbers, row_counts = np.empty(camera.shape, np.int32), np.empty(camera.height, np.int64)
-    run_ranges(camera.height, lambda start, stop: kernels.resolve(start, stop, buffers, numbers, row_counts))
+    numbers = np.empty(camera.shape, np.int32)
+    run_ranges(camera.height, lambda start, stop: kernels.resolve(start, stop, buffers, numbers))
     depth_buffers.give_back(buffers)
-    return IndexMap(numbers, row_counts, candidates, landed)
-
-
-def shade(surfels: SurfelMap, seen: IndexMap) -> Float32:
-    """Return the model image (H, W, 8): position, normal, confidence and luminance, undefined where none is seen."""
-    pages, image = surfels.pages, np.empty((*seen.numbers.shape, 8), np.float32)
-    numbers, flat = seen.numbers.reshape(-1), image.reshape(-1)
-
-    def body(start: int, stop: int) -> None:
-        kernels.shade_pages(start, stop, seen.slots, pages.counts, seen.landed, numbers, pages.pool, flat)
-
-    run_ranges(len(seen.slots), body)
-    return image
+    flat, places, won = numbers.reshape(-1), np.empty(len(landed), np.uint8), np.empty(len(candidates), np.int32)
+    run_ranges(
+        len(candidates),
+        lambda start, stop: kernels.list_winners(start, stop, candidates, pages.counts, flat, landed, places, won),
+    )
+    return IndexMap(numbers, candidates, won, places, landed)
 
 
 def _even_shares(counts: Int32, parts: int) -> list[tuple[int, int]]:
@@ -142,63 +143,11 @@ def _even_shares(counts: Int32, parts: int) -> list[tuple[int, int]]:
     return list(pairwise(bounds.tolist()))
 
 
-class SurfelView(ModelView):
-    """The map seen from a pose, as a model image; rows are taken from it when they are asked for."""
-
-    def __init__(
-        self,
-        T_world_camera: Float64,
-        camera: PinholeCamera,
-        seen: IndexMap,
-        image: Float32,
-        stable_confidence: float,
-    ) -> None:
-        self.T_world_camera, self.camera, self.stable_confidence = T_world_camera, camera, stable_confidence
-        self.seen, self.image, self.index_map = seen, image, seen.numbers
-        self._offsets = np.concatenate([[0], np.cumsum(seen.row_counts)])
-
-    def __len__(self) -> int:
-        return int(self._offsets[-1])
-
-    @cached_property
-    def pixels(self) -> Int32:
-        """(N,) int32, row-major pixels of the rows."""
-        pixels = np.empty(len(self), np.int32)
-
-        def body(start: int, stop: int) -> None:
-            kernels.list_pixels(start, stop, self.index_map, self._offsets, pixels)
-
-        run_ranges(self.camera.height, body)
-        return pixels
-
-    @cached_property
-    def positions_m(self) -> Float32:  # type: ignore[override]
-        """(3, N) float32, world frame [m]."""
-        return np.ascontiguousarray(self._values[:, 0:3].T)
-
-    @cached_property
-    def normals(self) -> Float32:  # type: ignore[override]
-        """(3, N) float32, world frame, unit."""
-        return np.ascontiguousarray(self._values[:, 3:6].T)
-
-    @cached_property
-    def confidences(self) -> Float32:  # type: ignore[override]
-        """(N,) float32."""
-        return np.take(self.image[..., 6].reshape(-1), self.pixels)
-
-    @cached_property
-    def intensities(self) -> Float32:  # type: ignore[override]
-        """(N,) float32, luminance 0..255 (ITU-R BT.601)."""
-        return np.take(self.image[..., 7].reshape(-1), self.pixels)
-
-    def take(self, rows: Int64) -> ModelRows:
-        """Return some of the rows (M,), in the given order; the others are not read."""
-        values = np.take(self.image.reshape(-1, 8), self.pixels[rows], axis=0).T.copy()
-        return ModelRows(values[0:3], values[3:6], values[6], values[7])
-
-    @cached_property
-    def _values(self) -> Float32:
-        return np.take(self.image.reshape(-1, 8), self.pixels, axis=0)
+def as_view(
+    rows: Int32, values: Float32, T_world_camera: Float64, camera: PinholeCamera, stable_confidence: float
+) -> ModelView:
+    """Return rows (H, W) and values (8, N), see the kernel `show_page`, as a view."""
+    return ModelView(T_world_camera, camera, values[0:3], values[3:6], values[6], rows, stable_confidence, values[7])
 
 
 def render_model_view(
@@ -208,10 +157,17 @@ def render_model_view(
     camera: PinholeCamera,
     stable_confidence: float = 0.0,
     depth_buffers: DepthBuffers | None = None,
-) -> SurfelView:
-    """Return the visible surfels, one at most per pixel, in row-major order of the pixels."""
+) -> ModelView:
+    """Return the visible surfels, one at most per pixel."""
     seen = render_index_map(surfels, candidates, T_world_camera, camera, stable_confidence, depth_buffers)
-    return SurfelView(T_world_camera, camera, seen, shade(surfels, seen), stable_confidence)
+    offsets, rows, values = seen.room()
+    flat, pool = rows.reshape(-1), surfels.pages.pool
+
+    def show(start: int, stop: int) -> None:
+        kernels.show_pages(start, stop, seen.slots, seen.places, seen.pixels, seen.won, offsets, pool, flat, values)
+
+    run_ranges(len(seen.slots), show)
+    return as_view(rows, values, T_world_camera, camera, stable_confidence)
 
 
 BACKGROUND = 216
@@ -245,19 +201,21 @@ def render_picture(
     background: int = BACKGROUND,
 ) -> Picture:
     """Draw the surfels as discs, nearest on top."""
-    candidates, pages = find_candidates(surfels, T_world_camera, camera), surfels.pages
+    pages = surfels.pages
     depth = np.full(camera.shape, np.inf, np.float32)
     rgb = np.full((*camera.shape, 3), background, np.float32)
     normals = np.zeros((*camera.shape, 3), np.float32)
     transform, intrinsics = _camera_arrays(T_world_camera, camera)
     rows, least = 60, np.float32(min_confidence)
 
-    def body(start: int, stop: int) -> None:
+    def body(start: int, stop: int, slots: Int32) -> None:
         kernels.splat_discs(
-            start, stop, candidates, pages.counts, pages.pool, least, transform, intrinsics, rows, depth, rgb, normals
+            start, stop, slots, pages.counts, pages.pool, least, transform, intrinsics, rows, depth, rgb, normals
         )
 
-    run_ranges(-(-camera.height // rows), body)
+    # Part by part: all of a map may be in view, and more than fits in memory.
+    for slots in pages.batches(pages.cull(frustum(T_world_camera, camera, VIEW_MARGIN_PIXELS, FARTHEST_M))):
+        run_ranges(-(-camera.height // rows), partial(body, slots=slots))
     return Picture(depth, np.clip(np.rint(rgb), 0, 255).astype(np.uint8), normals)
 
 

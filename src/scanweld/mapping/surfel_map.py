@@ -1,17 +1,17 @@
-"""Storage of surfels, and nothing else: pages that are culled, cleaned and sorted one by one."""
+"""Storage of surfels, and nothing else: columns over the pages that they live in."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 
 from scanweld.arrays import Array, Bool, Float32, Float64, Int32, Int64, UInt8
 from scanweld.errors import InvalidInputError
 from scanweld.geometry.views import MapCorrection
-from scanweld.mapping import kernels
-from scanweld.mapping.kernels import PAGE, ROWS
-from scanweld.mapping.pages import PagePool
+from scanweld.mapping.storage.kernels import PAGE, ROWS
+from scanweld.mapping.storage.pages import MapConfig, PagePool
+from scanweld.notebook import card, seen_from_above
 from scanweld.parallel import run_ranges
 
 _ROWS: dict[str, tuple[slice, type]] = {
@@ -33,17 +33,39 @@ class SurfelMap:
     Surfels live in pages, each of them within one cell of space (docs/decisions/0012-blocks.md): what is out of view
     is passed over page by page, and neighbours in space are neighbours in memory.
 
-    Properties are read-only copies of the live surfels, page by page; new ones are not always the last.
+    Properties are read-only copies of the live surfels, page by page; new ones are not always the last. A map may be
+    larger than memory (`MapConfig.memory_budget_mb`); then :meth:`batches` and :meth:`sample` are for it.
     """
 
-    def __init__(self, capacity: int = 1 << 16) -> None:
-        self.pages = PagePool(-(-capacity // PAGE))
+    def __init__(self, capacity: int = 1 << 16, config: MapConfig | None = None) -> None:
+        self.pages = PagePool(-(-capacity // PAGE), config)
         """The storage, for the kernels of fusion and rendering."""
         self.anchor = 0
         """Keyframe that new surfels move with."""
 
     def __len__(self) -> int:
-        return int(self.pages.counts.sum())
+        return self.pages.total
+
+    def __repr__(self) -> str:
+        return f"<SurfelMap of {len(self):,} surfels>"
+
+    def _repr_html_(self) -> str:
+        """Show the map in a notebook, from above."""
+        title = f"Map of {len(self):,} surfels"
+        if len(self) == 0:
+            return card(title, [])
+        some = self.sample(50_000)
+        points, normals, colors = (
+            np.column_stack([some[name] for name in names])
+            for names in (("x", "y", "z"), ("nx", "ny", "nz"), ("red", "green", "blue"))
+        )
+        extent = np.subtract(*np.quantile(points, [0.99, 0.01], axis=0))
+        rows = [
+            ("extent", " x ".join(f"{side:.2f}" for side in extent) + " m"),
+            ("radius", f"{1e3 * np.median(some['radius']):.1f} mm (median)"),
+            ("confidence", f"{np.median(some['confidence']):.1f} (median)"),
+        ]
+        return card(title, rows, picture=seen_from_above(points, normals, colors))
 
     @property
     def capacity(self) -> int:
@@ -63,7 +85,7 @@ class SurfelMap:
     @property
     def colors(self) -> UInt8:
         """(3, N) uint8, RGB (rounded; the map keeps fractions)."""
-        colors = np.clip(np.rint(self._column("colors")), 0, 255).astype(np.uint8)
+        colors = _rounded(self._column("colors"))
         colors.flags.writeable = False
         return colors
 
@@ -94,11 +116,26 @@ class SurfelMap:
 
     def columns(self) -> dict[str, Array]:
         """Return the map as named columns, in the order of the PLY file."""
-        p, n, c = self.positions_m, self.normals, self.colors
-        return {
-            "x": p[0], "y": p[1], "z": p[2], "nx": n[0], "ny": n[1], "nz": n[2],
-            "red": c[0], "green": c[1], "blue": c[2], "radius": self.radii_m, "confidence": self.confidences,
+        parts = list(self.batches())
+        if not parts:
+            return _file_columns(np.empty((ROWS, 0), np.float32))
+        return parts[0] if len(parts) == 1 else {
+            name: np.concatenate([part[name] for part in parts]) for name in parts[0]
         }  # fmt: skip
+
+    def batches(self) -> Iterator[dict[str, Array]]:
+        """Yield :meth:`columns` in parts, in order; with a memory budget none of them is larger."""
+        for slots in self.pages.batches():
+            yield _file_columns(self._rows(slots))
+
+    def sample(self, count: int) -> dict[str, Array]:
+        """Return about `count` surfels from all over the map, in the form of :meth:`columns`; all of a smaller one."""
+        step, first, parts = max(1, len(self) // max(count, 1)), 0, []
+        for slots in self.pages.batches():
+            numbers = self.pages.numbers_in(slots)
+            parts.append(self.pages.rows(numbers[-first % step :: step]))
+            first += len(numbers)
+        return _file_columns(np.concatenate([np.empty((ROWS, 0), np.float32), *parts], axis=1))
 
     def table(self) -> dict[str, Array]:
         """Return a copy of everything the map holds, colours as float32 with their fractions; see `replace`."""
@@ -106,7 +143,7 @@ class SurfelMap:
 
     def replace(self, table: Mapping[str, Array]) -> None:
         """Hold what a table says, in the form of `table()`, instead of what the map held."""
-        self.pages = PagePool(-(-len(table["radii_m"]) // PAGE))
+        self.pages = PagePool(-(-len(table["radii_m"]) // PAGE), self.pages.config)
         self._add(table)
 
     def append(
@@ -127,42 +164,21 @@ class SurfelMap:
             "confidences": confidences, "created": frames, "last_seen": frames, "anchors": anchors,
         })  # fmt: skip
 
-    def take_in(self, other: SurfelMap) -> Int64:
-        """Add the surfels of another map in the same world, as they are: their keyframes and ages stay theirs.
-
-        Returns at which places of the properties they are now (M,), in the order that they had.
-        """
-        return self._add(other.table())
+    def take_in(self, other: SurfelMap) -> None:
+        """Add the surfels of another map in the same world, as they are: their keyframes and ages stay theirs."""
+        for slots in other.pages.batches():
+            self.pages.add(other._rows(slots))
 
     def remove(self, doomed: Bool) -> int:
         """Drop the surfels where `doomed` (N,) is true; returns how many went."""
         if doomed.shape != (len(self),):
             raise InvalidInputError(f"map: expected a mask of shape ({len(self)},), got {doomed.shape}")
-        last, live, shrunk = 0, self.pages.live.tolist(), []
-        for slot, count in zip(live, self.pages.counts[live].tolist(), strict=True):
-            kept = ~doomed[last : last + count]
-            last += count
-            if not kept.all():
-                shrunk.append((slot, self.pages.page(slot)[:, kept]))
-        self.pages.shrink(shrunk)
+        self.pages.drop(self.pages.numbers_in(self.pages.live)[doomed])
         return int(np.count_nonzero(doomed))
 
     def clean(self, slots: Int64, frame_id: int, unstable_frames: int, stable_confidence: float) -> int:
         """Drop from pages what is unstable after so many frames, or without confidence; returns how many went."""
-        pages, before, stable = self.pages, self.pages.counts[slots], np.float32(stable_confidence)
-
-        def body(start: int, stop: int) -> None:
-            kernels.clean_pages(
-                start, stop, slots, frame_id, unstable_frames, stable, pages.pool, pages.whole, pages.counts,
-                pages.probation,
-            )  # fmt: skip
-
-        run_ranges(len(slots), body, grain=8)
-        pages.dirty[slots] = 0
-        after = pages.counts[slots]
-        for slot in slots[(after < before) & (after < PAGE // 4)].tolist():
-            pages.shrink([(slot, pages.page(slot).copy())])
-        return int((before - after).sum())
+        return self.pages.clean(slots, frame_id, unstable_frames, stable_confidence)
 
     def pages_in(self, planes: Float64) -> Int32:
         """Return the slots of the pages that may hold surfels on the inner side of all planes (6, 4)."""
@@ -177,37 +193,72 @@ class SurfelMap:
 
     def apply_correction(self, correction: MapCorrection) -> None:
         """Move the surfels of each named keyframe by its T_new_old."""
-        pages = self.pages
-        live, largest = pages.live, max(0, *correction.keyframe_ids.tolist())
-        table = np.tile(np.eye(4), (largest + 2, 1, 1))  # the last one is for the keyframes that stay
-        table[correction.keyframe_ids] = correction.T_new_old
+        pages, table = self.pages, motions(correction)
+        moves = (table != np.eye(4)).any(axis=(1, 2))
+        changed = [np.empty(0, np.int64)]
+        for slots in pages.batches():
+            moved: Bool = np.zeros(len(slots), np.bool_)
 
-        def body(start: int, stop: int) -> None:
-            for slot in live[start:stop].tolist():
-                rows = pages.page(slot)
-                T = table[np.minimum(rows[13].view(np.int32), largest + 1)]
-                rows[0:3] = np.einsum("nij,jn->in", T[:, :3, :3], rows[0:3]) + T[:, :3, 3].T
-                rows[3:6] = np.einsum("nij,jn->in", T[:, :3, :3], rows[3:6])
-                pages.fit_box(slot)
-                pages.cells[slot] = -1  # its cell is another one now
+            def body(start: int, stop: int, slots: Int64 = slots, moved: Bool = moved) -> None:
+                for k, slot in enumerate(slots[start:stop].tolist(), start):
+                    rows = pages.page(slot)
+                    anchors = np.minimum(rows[13].view(np.int32), len(table) - 1)
+                    if not moves[anchors].any():
+                        continue
+                    moved[k], T = True, table[anchors]
+                    rows[0:3] = np.einsum("nij,jn->in", T[:, :3, :3], rows[0:3]) + T[:, :3, 3].T
+                    rows[3:6] = np.einsum("nij,jn->in", T[:, :3, :3], rows[3:6])
 
-        run_ranges(len(live), body)
+            run_ranges(len(slots), body)
+            changed.append(slots[moved])
+            pages.fit_boxes(changed[-1])
+        pages.settle(np.concatenate(changed))
 
-    def _add(self, table: Mapping[str, Array]) -> Int64:
-        """Add surfels that come with all their columns; returns their places."""
+    def _add(self, table: Mapping[str, Array]) -> None:
+        """Add surfels that come with all their columns."""
         rows = np.empty((ROWS, len(table["radii_m"])), np.float32)
         for name, (some, kind) in _ROWS.items():
             rows[some] = np.asarray(table[name]).astype(kind).view(np.float32)
-        return self.rows_of(self.pages.add(rows))
+        self.pages.add(rows)
+
+    def _rows(self, slots: Int64, some: slice = slice(0, ROWS)) -> Float32:
+        """Return some rows of pages (R, N), a copy."""
+        rows = np.empty((some.stop - some.start, int(self.pages.counts[slots].sum())), np.float32)
+        done = 0
+        for slot in slots.tolist():
+            page = self.pages.page(slot)
+            rows[:, done : done + page.shape[1]] = page[some]
+            done += page.shape[1]
+        return rows
 
     def _column(self, name: str) -> Array:
-        rows, kind = _ROWS[name]
-        values: Array = np.empty((rows.stop - rows.start, len(self)), kind)
+        some, kind = _ROWS[name]
+        values: Array = np.empty((some.stop - some.start, len(self)), kind)
         done = 0
-        for slot in self.pages.live.tolist():
-            page = self.pages.page(slot)
-            values[:, done : done + page.shape[1]] = page[rows].view(kind)
-            done += page.shape[1]
+        for slots in self.pages.batches():
+            rows = self._rows(slots, some).view(kind)
+            values[:, done : done + rows.shape[1]] = rows
+            done += rows.shape[1]
         values = values if len(values) > 1 else values[0]
         values.flags.writeable = False
         return values
+
+
+def motions(correction: MapCorrection) -> Float64:
+    """Return T_new_old (A + 1, 4, 4) of each keyframe by its number; the last is for all those that stay."""
+    table = np.tile(np.eye(4), (int(correction.keyframe_ids.max(initial=0)) + 2, 1, 1))
+    table[correction.keyframe_ids] = correction.T_new_old
+    return table
+
+
+def _file_columns(rows: Float32) -> dict[str, Array]:
+    """Name rows (ROWS, N) as the PLY file does."""
+    c = _rounded(rows[_ROWS["colors"][0]])
+    return {
+        "x": rows[0], "y": rows[1], "z": rows[2], "nx": rows[3], "ny": rows[4], "nz": rows[5],
+        "red": c[0], "green": c[1], "blue": c[2], "radius": rows[7], "confidence": rows[6],
+    }  # fmt: skip
+
+
+def _rounded(colors: Float32) -> UInt8:
+    return np.clip(np.rint(colors), 0, 255).astype(np.uint8)

@@ -6,7 +6,10 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Any
 
+import numpy as np
+
 from scanweld.arrays import Float64
+from scanweld.notebook import BAD, DOUBTFUL, GOOD, card
 
 
 class Status(Enum):
@@ -91,3 +94,34 @@ class RegistrationResult:
     unobservable: tuple[FreeDirection, ...] = ()
     note: str = ""
     history: tuple[Any, ...] = ()
+
+    def __repr__(self) -> str:
+        about = [self.status.name]
+        if self.status.has_pose:
+            about += [self._motion(), f"overlap {self.overlap:.0%}", f"rmse {self.rmse_m:.3g} m"]
+        return f"<RegistrationResult {', '.join(about)}>"
+
+    def _repr_html_(self) -> str:
+        """Show the result in a notebook."""
+        answered = self.status.has_pose
+        mark = GOOD if self.status.success else DOUBTFUL if answered else BAD
+        rows = [
+            ("", self.note),
+            ("motion", self._motion() if answered else ""),
+            ("scale", f"{self.scale:.6g}" if self.scale != 1 else ""),
+            ("overlap", f"{self.overlap:.1%}, {self.num_inliers:,} pairs"),
+            ("rmse", f"{self.rmse_m:.4g} m" if answered else ""),
+            *(("left free", free.words) for free in self.unobservable if free.words not in self.note),
+            ("iterations", str(self.num_iterations)),
+        ]
+        matrix = self.T_target_source if answered else None
+        return card(f"Registration: {self.status.name}", rows, mark=mark, matrix=matrix)
+
+    def _motion(self) -> str:
+        rotation, shift_m = self.T_target_source[:-1, :-1], self.T_target_source[:-1, -1]
+        words = f"{np.linalg.norm(shift_m):.4g} m"
+        if len(rotation) > 3:
+            return words  # has no single angle
+        # |R - I|^2 = 8 sin^2(angle / 2) in the plane and in space alike; precise for small angles, too.
+        angle_rad = 2 * np.arcsin(min(1.0, np.linalg.norm(rotation - np.eye(len(rotation))) / np.sqrt(8)))
+        return f"{words}, {np.degrees(angle_rad):.3g} deg"

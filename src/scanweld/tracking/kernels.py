@@ -1,4 +1,7 @@
-"""Compiled kernels of the search for moving objects. Images are those of one pyramid level, see `SurfaceLevel`."""
+"""Compiled kernels that choose what is tracked and search for moving objects.
+
+Images are those of one pyramid level, see `SurfaceLevel`.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +11,21 @@ from scanweld.parallel import kernel
 
 CLOSED, OPEN, SEED = np.uint8(0), np.uint8(1), np.uint8(2)
 """What a pixel may be: without a surface; part of any surface; one that the model lacks, in space that was empty."""
+
+
+@kernel
+def list_rows(index_map, confidences, least, rows):
+    """List the rows of a view in the order of its pixels, those of at least this confidence; returns how many.
+
+    index_map (H, W) int32, confidences (N,) float32: see `ModelView`; rows (H * W + 1,) int64.
+    """
+    count = 0
+    for v in range(index_map.shape[0]):
+        for u in range(index_map.shape[1]):
+            row = index_map[v, u]
+            rows[count] = row  # written always, counted only when listed: no branch to mispredict
+            count += 1 if (row >= 0) & (confidences[np.uint64(max(row, np.int32(0)))] >= least) else 0
+    return count
 
 
 @kernel

@@ -7,7 +7,7 @@ fine. Translation is left out: it moves what is far by little, and the dense ali
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -15,7 +15,6 @@ from scanweld.arrays import Bool, Float32, Float64
 from scanweld.geometry import se3
 from scanweld.geometry.camera import PinholeCamera
 from scanweld.registration.photometric.residuals import half_grey
-from scanweld.registration.result import RegistrationResult, Status
 
 LARGEST_PIXELS = 80
 """Width of the finest image that is compared."""
@@ -57,39 +56,6 @@ class Turn:
 
     rotation: Float64
     correlation: float
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RotationPrior:
-    """A rotation that was measured by something else than the camera.
-
-    Attributes
-    ----------
-    rotation_world_camera : (3, 3)
-    std_rad : standard deviation of a rotation about any axis [rad]
-    """
-
-    rotation_world_camera: Float64
-    std_rad: float
-
-    def turned(self, T_camera_world: Float64) -> Float64:
-        """Return T_camera_world (4, 4) with the camera where it was, but turned as measured."""
-        T = np.eye(4)
-        T[:3, :3] = self.rotation_world_camera
-        T[:3, 3] = se3.inverse(T_camera_world)[:3, 3]
-        return se3.inverse(T)
-
-    def checked(self, result: RegistrationResult) -> RegistrationResult:
-        """Take the pose from a result T_camera_world whose rotation contradicts the measured one."""
-        off_rad = se3.rotation_angle_rad(result.T_target_source @ se3.inverse(self.turned(result.T_target_source)))
-        if off_rad <= max(CONTRADICTION_SIGMAS * self.std_rad, SMALL_RAD):
-            return result
-        note = f"turned {np.degrees(off_rad):.1f} degrees from the measured rotation"
-        return replace(result, status=Status.NO_OVERLAP, note=note)
-
-
-CONTRADICTION_SIGMAS, SMALL_RAD = 5.0, 0.01
-"""A rotation contradicts the measured one beyond so many standard deviations, and beyond this."""
 
 
 def thumbnails(grey: Float32, filled: Bool, camera: PinholeCamera) -> list[Thumbnail]:

@@ -11,12 +11,13 @@ from scanweld.config import check_ranges, section, setting
 from scanweld.errors import ConfigError
 from scanweld.geometry import se3
 from scanweld.geometry.depth import SurfacePyramid
-from scanweld.geometry.views import ModelRows, ModelView
+from scanweld.geometry.views import ModelView
 from scanweld.registration.photometric.refinement import Photometry
 from scanweld.registration.projective import ProjectiveConfig, align_projective, schedules
 from scanweld.registration.result import RegistrationResult, Status
 from scanweld.registration.verification import Agreement, check_against_depth
-from scanweld.tracking.rotation import RotationPrior, find_turns, thumbnails
+from scanweld.tracking import kernels
+from scanweld.tracking.rotation import find_turns, thumbnails
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -63,14 +64,7 @@ class FrameToModelTracker:
     def __init__(self, config: TrackingConfig | None = None) -> None:
         self.config = config or TrackingConfig()
 
-    def track(
-        self,
-        pyramid: SurfacePyramid,
-        view: ModelView,
-        T_world_camera: Float64,
-        *,
-        rotation_prior: RotationPrior | None = None,
-    ) -> RegistrationResult:
+    def track(self, pyramid: SurfacePyramid, view: ModelView, T_world_camera: Float64) -> RegistrationResult:
         """Align a frame with the map seen from close by.
 
         Parameters
@@ -78,7 +72,6 @@ class FrameToModelTracker:
         pyramid : the frame
         view : the map as seen from about `T_world_camera`
         T_world_camera : (4, 4), predicted pose
-        rotation_prior : a measured rotation, from a gyroscope say; it takes the place of the predicted one
 
         Returns
         -------
@@ -86,12 +79,10 @@ class FrameToModelTracker:
         perturbation of it, in world axes. Free directions are named in the camera's axes; along these the pose is the
         predicted one.
         """
-        rows, surfels = self._select(view)
-        light = self._photometry(pyramid, view, rows, surfels)
-        scene = _Scene(surfels.positions_m, surfels.normals, pyramid, light)
+        rows = self._select(view)
+        positions_m, normals = (np.take(side, rows, axis=1, mode="clip") for side in (view.positions_m, view.normals))
+        scene = _Scene(positions_m, normals, pyramid, self._photometry(pyramid, view, rows))
         T_camera_world = se3.inverse(T_world_camera)
-        if rotation_prior is not None:
-            T_camera_world = rotation_prior.turned(T_camera_world)
         first, *wider = schedules(self.config.projective)
         strict = replace(wider[0], coarse_gate_m=first.coarse_gate_m, min_cosine=first.min_cosine) if wider else first
         best = scene.align(T_camera_world, first)
@@ -108,8 +99,6 @@ class FrameToModelTracker:
                 if result.status is Status.CONVERGED:  # after a wide search nothing less is worth a pose
                     best = result
                     break
-        if rotation_prior is not None and best.status.has_pose:
-            best = rotation_prior.checked(best)
         # The aligner moves the map to the camera: T_cw <- exp(xi) T_cw. With T_wc <- exp(eta) T_wc, xi = -Ad(T_cw) eta.
         adjoint = se3.adjoint(best.T_target_source)
         return replace(
@@ -147,38 +136,39 @@ class FrameToModelTracker:
                 return result
         return best
 
-    def _select(self, view: ModelView) -> tuple[Int64, ModelRows]:
+    def _select(self, view: ModelView) -> Int64:
         """Choose the rows (M,) of the view to track against, in the order of the image.
 
         Where half of the view is stable, only stable surfels count: the others are mostly noise. A map that is young or
-        new to this place has nothing better than all of them. Only an even share of the image is looked at, twice as
-        many as the aligner reads.
+        new to this place has nothing better than all of them.
         """
         config = self.config
-        most = config.projective.max_points
-        rows = np.arange(0, len(view), max(1, int(len(view) * config.stable_fraction) // (2 * most)), dtype=np.int64)
-        surfels = view.take(rows)
-        stable = np.flatnonzero(surfels.confidences >= view.stable_confidence)
-        if len(stable) < MIN_STABLE_SHARE * len(rows):
-            stable = np.arange(len(rows))
-        wanted = max(round(config.stable_fraction * len(stable)), config.projective.min_points)
-        if wanted < len(stable):
+        rows = _listed(view, view.stable_confidence)
+        if len(rows) < MIN_STABLE_SHARE * len(view):
+            rows = _listed(view, -np.inf)
+        wanted = max(round(config.stable_fraction * len(rows)), config.projective.min_points)
+        if wanted < len(rows):
             # Confidence stops growing, so ties are the rule: those at the limit are taken evenly over the image.
-            confidences = surfels.confidences[stable]
-            limit = np.partition(confidences, len(stable) - wanted)[len(stable) - wanted]
+            confidences = view.confidences[rows]
+            limit = np.partition(confidences, len(rows) - wanted)[len(rows) - wanted]
             above, tied = np.flatnonzero(confidences > limit), np.flatnonzero(confidences == limit)
             more = wanted - len(above)
-            stable = stable[np.sort(np.concatenate([above, tied[np.arange(more) * len(tied) // more]]))]
-        stable = stable[:: max(1, -(-len(stable) // most))]
-        return (rows, surfels) if len(stable) == len(rows) else (rows[stable], surfels.take(stable))
+            rows = rows[np.sort(np.concatenate([above, tied[np.arange(more) * len(tied) // more]]))]
+        return rows[:: max(1, -(-len(rows) // config.projective.max_points))]
 
-    def _photometry(
-        self, pyramid: SurfacePyramid, view: ModelView, rows: Int64, surfels: ModelRows
-    ) -> Photometry | None:
+    def _photometry(self, pyramid: SurfacePyramid, view: ModelView, rows: Int64) -> Photometry | None:
         """Return the brightness of both sides where there is any and it is wanted."""
-        if not self.config.uses_photometry or pyramid.grey is None or surfels.intensities is None:
+        if not self.config.uses_photometry or pyramid.grey is None or view.intensities is None:
             return None
-        return Photometry(surfels.intensities, pyramid.grey, view, rows)
+        return Photometry(view.intensities[rows], pyramid.grey, view, rows)
+
+
+def _listed(view: ModelView, least: float) -> Int64:
+    """List the rows (M,) of at least this confidence in the order of the image."""
+    if len(view) == 0:
+        return np.empty(0, np.int64)
+    rows = np.empty(view.index_map.size + 1, np.int64)
+    return rows[: kernels.list_rows(view.index_map, view.confidences, np.float32(least), rows)]
 
 
 @dataclass(frozen=True, slots=True)

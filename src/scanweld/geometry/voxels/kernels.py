@@ -25,6 +25,18 @@ def first_slot(key, mask):
     return np.int64((np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)) >> np.uint64(32)) & mask
 
 
+@inlined
+def slot_of(key, keys, table):
+    """Where the label of a key is in the table, or the free slot where it belongs."""
+    mask = len(table) - 1
+    slot = first_slot(key, mask)
+    label = table[slot]
+    while label >= 0 and keys[label] != key:
+        slot = (slot + 1) & mask
+        label = table[slot]
+    return slot
+
+
 @kernel
 def label_points(points, first, origin, side, sizes, table, labels, keys, firsts, count):
     """Give points (N, D), from row `first` on, the label of their voxel, numbered as they come.
@@ -33,7 +45,6 @@ def label_points(points, first, origin, side, sizes, table, labels, keys, firsts
     row-major number and first point of each label. Returns the next row, which is short of N when the table has become
     too full, and the number of labels.
     """
-    mask = len(table) - 1
     largest = min(len(table) // 2, len(keys))
     key, label = np.int64(-1), np.int32(-1)
     for n in range(first, len(points)):
@@ -42,11 +53,8 @@ def label_points(points, first, origin, side, sizes, table, labels, keys, firsts
         for axis in range(points.shape[1]):
             key = key * sizes[axis] + voxel_number(points[n, axis], origin[axis], side)
         if key != last:  # consecutive points often share a voxel
-            slot = first_slot(key, mask)
+            slot = slot_of(key, keys, table)
             label = table[slot]
-            while label >= 0 and keys[label] != key:
-                slot = (slot + 1) & mask
-                label = table[slot]
             if label < 0:
                 if count == largest:
                     return n, count

@@ -12,8 +12,11 @@ import numpy as np
 
 from scanweld.arrays import Array, Bool, Float32, Float64, Int64
 from scanweld.config import check_ranges, setting
+from scanweld.geometry import se3
+from scanweld.geometry.views import MapCorrection
 from scanweld.mapping.merging import kernels
-from scanweld.mapping.surfel_map import SurfelMap
+from scanweld.mapping.storage.kernels import PAGE
+from scanweld.mapping.surfel_map import SurfelMap, motions
 
 _COSINE = 0.7
 _RADIUS_CLASS = 1.5  # surfels within this factor are equally fine; Keller et al. 2013 refine by the same factor
@@ -38,72 +41,102 @@ class MergingConfig:
         check_ranges(self)
 
 
-def merge_doubled(surfels: SurfelMap, moved_m: Float32, most: float, config: MergingConfig | None = None) -> int:
+def merge_doubled(
+    surfels: SurfelMap, correction: MapCorrection, most: float, config: MergingConfig | None = None
+) -> int:
     """Fuse the layers that different passes left of a surface; the map is changed, returns how many surfels went.
 
     The finer surfels of the two layers stay, moved along their normals to the mean that the confidences weigh.
 
     Parameters
     ----------
-    surfels : the map
-    moved_m : (3, N), how far the correction has moved each surfel [m]; where all moved alike nothing is looked for
+    surfels : the map, after the correction
+    correction : what it was moved by; where all moved alike nothing is looked for
     most : largest confidence of a surfel
     config : when layers are one surface
     """
     config = config or MergingConfig()
     if config.distance_m == 0:
         return 0
-    rows = np.flatnonzero(_brought_together(surfels, moved_m, config.gap))
-    if len(rows) == 0:
+    pages, numbers = surfels.pages, _brought_together(surfels, correction, config.gap)
+    if len(numbers) == 0:
         return 0
-    positions = surfels.positions_m[:, rows].astype(np.float64)
-    side = max(config.distance_m, float(surfels.radii_m[rows].max()))
-    keys = _cells(positions, side)
+    rows = pages.rows(numbers)
+    side = max(config.distance_m, float(rows[7].max()))
+    keys = _cells(rows[:3].astype(np.float64), side)
     order = np.argsort(keys, kind="stable")
-    rows, keys = rows[order], keys[order]
+    numbers, keys, rows = numbers[order], keys[order], rows[:, order]
     cells, cell_of = np.unique(keys, return_inverse=True)
-    table = surfels.table()
-    p, n, c, r, weights = (
-        np.ascontiguousarray(table[name][..., rows])
-        for name in ("positions_m", "normals", "colors", "radii_m", "confidences")
-    )
+    p, n, c, r, weights = rows[0:3], rows[3:6], rows[8:11], rows[7], rows[6]
     fineness = np.floor(np.log(np.maximum(r, 1e-6)) / np.log(_RADIUS_CLASS))
     ranking = np.lexsort((-weights, fineness)).astype(np.int64)
     rank = np.empty_like(ranking)
     rank[ranking] = np.arange(len(ranking))
-    taken: Bool = np.zeros(len(rows), np.bool_)
+    taken: Bool = np.zeros(len(numbers), np.bool_)
     limits = np.array([config.distance_m, _COSINE, most], np.float32)
     kernels.merge_layers(
         ranking, rank, cell_of.astype(np.int64).ravel(), _around(cells, keys), p, n, c, r, weights,
-        table["anchors"][rows], config.gap, limits, taken,
+        rows[13].view(np.int32), config.gap, limits, taken,
     )  # fmt: skip
-    table["positions_m"][:, rows], table["normals"][:, rows], table["colors"][:, rows] = p, n, c
-    table["confidences"][rows] = weights
-    kept = np.ones(len(surfels), np.bool_)
-    kept[rows[taken]] = False
-    surfels.replace({name: column[..., kept] for name, column in table.items()})
+    slots = np.unique(numbers // PAGE)
+    pages.use(slots)
+    pages.put(numbers, rows)
+    pages.fit_boxes(slots)
+    pages.settle(slots)
+    pages.drop(numbers[taken])
     return int(np.count_nonzero(taken))
 
 
-def _brought_together(surfels: SurfelMap, moved_m: Float32, gap: int) -> Bool:
-    """Whether a surfel (N,) is in an area whose surfels are of more than one pass and moved in different ways."""
-    anchors = surfels.anchors
-    if len(surfels) == 0 or int(np.ptp(anchors)) < gap:
-        return np.zeros(len(surfels), np.bool_)
-    keys = _cells(surfels.positions_m.astype(np.float64), _AREA_M)
+def _brought_together(surfels: SurfelMap, correction: MapCorrection, gap: int) -> Int64:
+    """Return the numbers of the surfels in areas that more than one pass saw, and that moved in different ways."""
+    pages, T_old_new = surfels.pages, se3.inverse(motions(correction))
+
+    def looked_at(slots: Int64) -> tuple[Int64, Int64, Float32]:
+        numbers = pages.numbers_in(slots)
+        rows = pages.rows(numbers)
+        return numbers, _areas(rows[:3]), rows
+
+    # Of each area (A,), from all batches: its key, and the least and the largest anchor and motion (4, A) there.
+    found: tuple[Int64, Float64, Float64] = np.empty(0, np.int64), np.empty((4, 0)), np.empty((4, 0))
+    for slots in pages.batches():
+        _, keys, rows = looked_at(slots)
+        anchors = rows[13].view(np.int32)
+        T = T_old_new[np.minimum(anchors, len(T_old_new) - 1)]
+        moved = rows[:3] - np.einsum("nij,jn->in", T[:, :3, :3], rows[:3]) - T[:, :3, 3].T
+        values = np.concatenate([anchors[None], moved])
+        found = _by_area(
+            np.concatenate([found[0], keys]),
+            np.concatenate([found[1], values], axis=1),
+            np.concatenate([found[2], values], axis=1),
+        )
+    areas, least, largest = found
+    apart = (largest - least)[1:].max(axis=0, initial=0.0)
+    areas = areas[((largest - least)[0] >= gap) & (apart > _MOVED_M)]
+    chosen = [np.empty(0, np.int64)]
+    for slots in pages.batches() if len(areas) else ():
+        numbers, keys, _ = looked_at(slots)
+        chosen.append(numbers[np.isin(keys, areas)])
+    return np.concatenate(chosen)
+
+
+def _by_area(keys: Int64, least: Float64, largest: Float64) -> tuple[Int64, Float64, Float64]:
+    """Return each key once, with the least of the least values (R, N) and the largest of the largest."""
     order = np.argsort(keys, kind="stable")
-    first = np.flatnonzero(np.diff(keys[order], prepend=-1))
-    together = _range_within(anchors[order], first) >= gap
-    apart = np.max([_range_within(row[order], first) for row in moved_m], axis=0)
-    chosen = np.repeat(together & (apart > _MOVED_M), np.diff(first, append=len(keys)))
-    result: Bool = np.empty(len(keys), np.bool_)
-    result[order] = chosen
-    return result
+    keys = keys[order]
+    first = np.flatnonzero(np.diff(keys, prepend=-1))
+    if len(first) == 0:
+        return keys, least, largest
+    return (
+        keys[first],
+        np.minimum.reduceat(least[:, order], first, axis=1),
+        np.maximum.reduceat(largest[:, order], first, axis=1),
+    )
 
 
-def _range_within(values: Array, first: Int64) -> Array:
-    """Return the largest minus the smallest value of each group; groups begin at `first`."""
-    return np.asarray(np.maximum.reduceat(values, first) - np.minimum.reduceat(values, first))
+def _areas(positions_m: Float32) -> Int64:
+    """Return the key of the area of each position (3, N), the same in every batch."""
+    lattice = np.floor(positions_m.astype(np.float64) / _AREA_M).astype(np.int64) + (1 << _BITS - 1)
+    return np.asarray(lattice[0] | lattice[1] << _BITS | lattice[2] << 2 * _BITS)
 
 
 def _cells(positions_m: Float64, side_m: float) -> Int64:

@@ -57,14 +57,15 @@ class Photometry:
     @cached_property
     def pixels(self) -> Int64:
         """(N,) row-major pixels of the source points in their view."""
-        return np.flatnonzero(self.view.index_map.ravel() >= 0)[self.rows]
+        return self.view.pixels[self.rows]
 
     @cached_property
     def pictures(self) -> list[tuple[Float32, Bool]]:
         """The source's view, level by level: grey images and where they are filled."""
         filled = self.view.index_map >= 0
         grey = np.zeros(filled.shape, np.float32)
-        grey[filled] = self.view.intensities
+        assert self.view.intensities is not None
+        grey[filled] = self.view.intensities[self.view.index_map[filled]]
         pictures: list[tuple[Float32, Bool]] = [(grey, filled)]
         while min(filled.shape) >= 32:
             grey, filled = pictures[-1]

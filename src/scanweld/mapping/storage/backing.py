@@ -1,0 +1,97 @@
+"""The memory that pages lie in: the process's own, or a file of which only a part need be in memory."""
+
+from __future__ import annotations
+
+import logging
+import mmap
+import os
+import tempfile
+import weakref
+from collections.abc import Iterable
+
+import numpy as np
+
+from scanweld.arrays import Float32
+
+logger = logging.getLogger(__name__)
+
+
+class Memory:
+    """The process's own memory; the array is copied when it grows."""
+
+    paged = False
+    """Whether parts of the array can leave memory."""
+
+    def grow(self, array: Float32, size: int) -> Float32:
+        """Return an array of `size` numbers that begins with what `array` holds."""
+        grown: Float32 = np.empty(size, np.float32)
+        grown[: len(array)] = array
+        return grown
+
+    def recall(self, ranges: Iterable[tuple[int, int]]) -> None:
+        """Say that parts of the array, as (first, last + 1), are going to be read."""
+
+    def let_go(self, ranges: Iterable[tuple[int, int]]) -> None:
+        """Say that parts of the array will not be needed for a while."""
+
+
+class MappedFile(Memory):
+    """A file without a name in `folder` ("": the system's choice) that is mapped into memory, and gone with the object.
+
+    What the map writes goes to the file, sooner or later, as the system likes; parts that are let go leave the memory
+    of the process and come back by themselves when they are read. So no result can depend on what is where.
+    """
+
+    def __init__(self, folder: str = "") -> None:
+        self._folder = folder
+        self._file: int | None = None
+        self._map: mmap.mmap | None = None
+
+    @property
+    def paged(self) -> bool:  # type: ignore[override]
+        """Whether parts of the array can leave memory: not where the file could not be made, nor without `madvise`."""
+        return self._map is not None and hasattr(self._map, "madvise")
+
+    def grow(self, array: Float32, size: int) -> Float32:
+        """Return an array of `size` numbers that begins with what `array` holds; nothing is copied but at first."""
+        if len(array) and self._map is None:  # the file failed before
+            return super().grow(array, size)
+        try:
+            grown = self._mapped(size)
+        except (OSError, ValueError) as error:
+            logger.warning(
+                "memory_budget_mb: no file of %.0f MB for the map in %s (%s); the map stays in memory from here on",
+                4e-6 * size, self._folder or tempfile.gettempdir(), getattr(error, "strerror", None) or error,
+            )  # fmt: skip
+            self._map = None
+            return super().grow(array, size)
+        return grown
+
+    def recall(self, ranges: Iterable[tuple[int, int]]) -> None:
+        """Have the system read parts of the array from the file, without waiting for it."""
+        self._advise(ranges, "MADV_WILLNEED")
+
+    def let_go(self, ranges: Iterable[tuple[int, int]]) -> None:
+        """Take parts of the array out of the process's memory; the file has them."""
+        self._advise(ranges, "MADV_DONTNEED")
+
+    def _advise(self, ranges: Iterable[tuple[int, int]], advice: str) -> None:
+        if not self.paged or not hasattr(mmap, advice):
+            return
+        assert self._map is not None
+        for first, end in ranges:
+            start = 4 * first // mmap.PAGESIZE * mmap.PAGESIZE
+            self._map.madvise(getattr(mmap, advice), start, min(4 * end, len(self._map)) - start)
+
+    def _mapped(self, size: int) -> Float32:
+        """Make the file large enough and map all of it; arrays of earlier mappings see the same bytes."""
+        if self._file is None:
+            with tempfile.TemporaryFile(dir=self._folder or None) as file:
+                self._file = os.dup(file.fileno())
+            weakref.finalize(self, os.close, self._file)
+        if hasattr(os, "posix_fallocate"):  # a full disk is an error here, and would be a crash when it is written to
+            os.posix_fallocate(self._file, 0, 4 * size)
+        else:
+            os.ftruncate(self._file, 4 * size)
+        self._map = mmap.mmap(self._file, 4 * size)
+        return np.frombuffer(self._map, np.float32)

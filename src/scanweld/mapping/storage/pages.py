@@ -1,0 +1,312 @@
+"""Pages of surfels: the storage that the kernels of the map work on, all of it in memory or a part of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from scanweld.arrays import Array, Float32, Float64, Int32, Int64, UInt8
+from scanweld.config import check_ranges, setting
+from scanweld.mapping.storage import kernels
+from scanweld.mapping.storage.backing import MappedFile, Memory
+from scanweld.mapping.storage.kernels import PAGE, ROWS, SHELF, SPAN, STRIDE
+from scanweld.mapping.storage.residence import Residence
+from scanweld.parallel import run_ranges
+
+CELL_M = 0.25
+"""Edge of the cells that pages belong to [m]: a page is in view or not as a whole, and a cell of a wall seen from 3 m
+is fifty pixels wide, so that what is read of the image for a page stays in the cache."""
+
+BOX_TURNS = 64
+"""Looks at the map after which the box of each page in view is brought up to date."""
+
+BATCHES = 4
+"""Parts of the memory budget, one of which a batch of pages takes: others hold what is made of it."""
+
+NEVER = 0x7FFFFFFF
+"""Probation of a page without anything unstable."""
+
+_PER_CELL = np.float32(1 / CELL_M)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MapConfig:
+    """Where the map is kept."""
+
+    memory_budget_mb: float = setting(
+        0.0,
+        "memory for surfels [MB]; what was not in view lately waits on disk, results stay the same. 0 keeps all in "
+        "memory; set it for recordings of hours, 17 million surfels take a gigabyte",
+        low=0.0,
+    )
+    folder: str = setting(
+        "",
+        "folder on a disk for what waits there; empty: beside the run's results, or else the system's for such files",
+    )
+
+    def __post_init__(self) -> None:
+        check_ranges(self)
+
+
+class PagePool:
+    """Pages in one array that grows when it is full, and a hash table of the cells that they lie in.
+
+    With a memory budget the array is a file, of which the shelves that were used last are in memory. A shelf is used by
+    naming its pages: `inside`, `use` and `batches` do; kernels may read any page at any time, but one that was not
+    named is not counted.
+
+    Attributes
+    ----------
+    pool : (capacity * SPAN,) float32, see `kernels`
+    counts : (capacity,) int32, surfels of each page
+    boxes : (capacity, 6) float32, lower and upper corner of what each page holds [m]
+    shelves : (ceil(capacity / SHELF), 6) float32, around the boxes of each shelf's pages, which may be smaller
+    cells : (capacity,) int64, key of the cell that each page fills
+    probation : (capacity,) int32, first frame of what may be unstable in each page
+    dirty : (capacity,) uint8, pages with a surfel that lost confidence
+    total : surfels of all pages
+    """
+
+    def __init__(self, capacity: int, config: MapConfig | None = None) -> None:
+        self.config = config or MapConfig()
+        self.total = 0
+        budget = self.config.memory_budget_mb
+        self._backing = MappedFile(self.config.folder) if budget > 0 else Memory()
+        self._residence = Residence(self._backing, SHELF * SPAN, int(budget * 1e6 / 4))
+        self._looks = 0
+        self._waiting: dict[int, list[Int32]] = {}
+        self._keys: Int64 = np.full(1 << 10, -1, np.int64)
+        self._tails: Int32 = np.full(1 << 10, -1, np.int32)
+        self._room = len(self._keys) // 2
+        for name, values in _columns(0).items():
+            setattr(self, name, values)
+        self.pool: Float32 = np.empty(0, np.float32)
+        self._free: Int32 = np.empty(0, np.int32)
+        self._num_free = 0
+        self._grow(max(1, capacity))
+
+    counts: Int32
+    boxes: Float32
+    shelves: Float32
+    cells: Int64
+    probation: Int32
+    dirty: UInt8
+
+    @property
+    def whole(self) -> Int32:
+        """The bytes of `pool` as int32."""
+        return self.pool.view(np.int32)
+
+    @property
+    def capacity(self) -> int:
+        """Pages that fit before the array grows."""
+        return len(self.counts)
+
+    @property
+    def live(self) -> Int64:
+        """Slots of the pages with surfels."""
+        return np.flatnonzero(self.counts)
+
+    @property
+    def resident_mb(self) -> float:
+        """Memory that the pages take, counted by whole shelves [MB]."""
+        return 4e-6 * (self._residence.num_held * SHELF * SPAN if self._backing.paged else len(self.pool))
+
+    def page(self, slot: int) -> Float32:
+        """Return the rows (ROWS, count) of a page, a view."""
+        return self.pool.reshape(-1, ROWS, STRIDE)[slot, :, : self.counts[slot]]
+
+    def use(self, slots: Array) -> None:
+        """Have pages in memory; others go where the budget asks for it, those first that were used longest ago."""
+        if self._backing.paged:
+            self._residence.use(np.unique(slots // SHELF))
+
+    def batches(self, slots: Array | None = None) -> Iterator[Array]:
+        """Yield slots, by default those of all pages with surfels, in parts that fit the budget; each is in memory."""
+        slots = self.live if slots is None else slots
+        if len(slots) == 0:
+            return
+        shelf = np.cumsum(np.diff(slots // SHELF, prepend=slots[0] // SHELF) != 0)
+        part = shelf // max(1, self._residence.room // BATCHES) if self._backing.paged else np.zeros(len(slots))
+        for some in np.split(slots, np.flatnonzero(np.diff(part)) + 1):
+            self.use(some)
+            yield some
+
+    def numbers_in(self, slots: Array) -> Int64:
+        """Return the numbers (N,) of the surfels of pages, page by page."""
+        counts = self.counts[slots].astype(np.int64)
+        first = np.cumsum(counts) - counts
+        return np.asarray(np.repeat(slots * np.int64(PAGE) - first, counts) + np.arange(int(counts.sum())))
+
+    def rows(self, numbers: Int64) -> Float32:
+        """Return the rows (ROWS, N) of surfels."""
+        return np.asarray(self.pool[_places(numbers)])
+
+    def put(self, numbers: Int64, rows: Float32) -> None:
+        """Give surfels new rows (ROWS, N); whoever moves them calls :meth:`fit_boxes`."""
+        self.pool[_places(numbers)] = rows
+
+    def add(self, rows: Float32) -> Int32:
+        """Put surfels (ROWS, N) into pages of the cells that they lie in; returns their numbers (N,)."""
+        done, total = 0, rows.shape[1]
+        numbers = np.empty(total, np.int32)
+        while done < total:
+            if self._num_free == 0:
+                self._grow(self._next_capacity())
+            if self._room == 0:
+                self._rehash()
+            done, self._num_free, self._room = kernels.deposit(
+                done, rows, _PER_CELL, self._free, self._num_free, self._room, self.counts, self.boxes, self.shelves,
+                self.cells, self.probation, self._keys, self._tails, self.pool, numbers,
+            )  # fmt: skip
+        self.total += total
+        if total:
+            touched = np.unique(numbers // PAGE)
+            self.use(touched)
+            first = int(rows[11].view(np.int32).min())
+            self.probation[touched] = np.minimum(self.probation[touched], first)
+            self._waiting.setdefault(first, []).append(touched)
+        return numbers
+
+    def on_probation_since(self, frame_id: int) -> Int64:
+        """Return the slots, in order, of the pages with something that was new before a frame, and may be unstable.
+
+        They are not named again unless :meth:`clean` says so, so they have to be cleaned.
+        """
+        due = [frame for frame in self._waiting if frame < frame_id]
+        named = [slots for frame in due for slots in self._waiting.pop(frame)]
+        slots = np.unique(np.concatenate(named)).astype(np.int64) if named else np.empty(0, np.int64)
+        return slots[(self.counts[slots] > 0) & (self.probation[slots] < frame_id)]
+
+    def clean(self, slots: Int64, frame_id: int, unstable_frames: int, stable_confidence: float) -> int:
+        """Drop from pages what is unstable after so many frames, or without confidence; returns how many went."""
+        before, stable, whole = self.counts[slots], np.float32(stable_confidence), self.whole
+
+        def body(start: int, stop: int, some: Int64) -> None:
+            kernels.clean_pages(
+                start, stop, some, frame_id, unstable_frames, stable, self.pool, whole, self.counts, self.probation
+            )
+
+        for some in self.batches(slots):
+            run_ranges(len(some), partial(body, some=some), grain=8)
+        self.dirty[slots] = 0
+        after, since = self.counts[slots], self.probation[slots]
+        self.total -= int((before - after).sum())
+        for first in np.unique(since[(after > 0) & (since < NEVER)]).tolist():
+            self._waiting.setdefault(first, []).append(slots[(after > 0) & (since == first)].astype(np.int32))
+        # Only now: where surfels go must not depend on what fitted into a batch.
+        for slot in slots[(after < before) & (after < PAGE // 4)].tolist():
+            self.shrink([(slot, self.page(slot).copy())])
+        return int((before - after).sum())
+
+    def release(self, slot: int) -> None:
+        """Give a page back."""
+        self.total -= int(self.counts[slot])
+        self.counts[slot] = self.dirty[slot] = 0
+        self.cells[slot] = -1
+        self._free[self._num_free] = slot
+        self._num_free += 1
+
+    def shrink(self, pages: Sequence[tuple[int, Float32]]) -> None:
+        """Let pages hold `rows` (ROWS, count) each, not more than before; nearly empty ones are given up."""
+        homeless = []
+        for slot, rows in pages:
+            self.total -= int(self.counts[slot]) - rows.shape[1]
+            self.counts[slot] = rows.shape[1]
+            self.page(slot)[:] = rows
+            if rows.shape[1] < PAGE // 4:
+                self.release(slot)
+                homeless.append(rows)
+        for rows in homeless:  # only now: they may come into a page that was shrunk, too
+            self.add(rows)
+
+    def drop(self, numbers: Int64) -> None:
+        """Remove surfels."""
+        if len(numbers) == 0:
+            return
+        gone = np.unique(numbers)
+        slots, first = np.unique(gone // PAGE, return_index=True)
+        self.use(slots)
+        self.shrink([
+            (slot, np.delete(self.page(slot), places % PAGE, axis=1))
+            for slot, places in zip(slots.tolist(), np.split(gone, first[1:]), strict=True)
+        ])  # fmt: skip
+
+    def cull(self, planes: Float64) -> Int32:
+        """Return the slots whose boxes are not wholly outside one of the planes (6, 4): n . x + d >= 0 is inside."""
+        slots = np.empty(self.capacity, np.int32)
+        found = kernels.cull_pages(self.counts, self.boxes, self.shelves, planes.astype(np.float32), slots)
+        return slots[:found].copy()
+
+    def inside(self, planes: Float64) -> Int32:
+        """Return what :meth:`cull` does, and have these pages in memory."""
+        slots = self.cull(planes)
+        self.use(slots)
+        self._looks += 1
+        self.fit_boxes(slots[self._looks % BOX_TURNS :: BOX_TURNS])  # merging moves surfels a little
+        return slots
+
+    def fit_boxes(self, slots: Array) -> None:
+        """Bring the boxes of pages up to date."""
+        slots = np.ascontiguousarray(slots, np.int64)
+
+        def body(start: int, stop: int) -> None:
+            kernels.fit_boxes(start, stop, slots, self.counts, self.pool, self.boxes)
+
+        run_ranges(len(slots), body, grain=64)
+        np.minimum.at(self.shelves[:, :3], slots // SHELF, self.boxes[slots, :3])
+        np.maximum.at(self.shelves[:, 3:], slots // SHELF, self.boxes[slots, 3:])
+
+    def settle(self, slots: Int64) -> None:
+        """Let pages that were moved, all at once, be those of the cells that their boxes have come to."""
+        self.cells[slots] = -1
+        if self._room < len(slots):
+            self._rehash(len(slots))
+        self._room -= kernels.settle_pages(
+            slots, _PER_CELL, self.counts, self.boxes, self.cells, self._keys, self._tails
+        )
+
+    def _next_capacity(self) -> int:
+        """How many pages there should be room for; a file grows without being copied, so by less at a time."""
+        return self.capacity + (max(self.capacity // 4, SHELF) if self._backing.paged else self.capacity)
+
+    def _grow(self, capacity: int) -> None:
+        before = self.capacity
+        for name, values in _columns(capacity).items():
+            old = getattr(self, name)
+            values[: len(old)] = old
+            setattr(self, name, values)
+        self.pool = self._backing.grow(self.pool, capacity * SPAN)
+        self._residence.grow(len(self.shelves))
+        # Called when all pages are taken: the lowest of the new ones come first, so that shelves are filled in turn.
+        self._free = np.empty(capacity, np.int32)
+        self._free[: capacity - before] = np.arange(before, capacity)[::-1]
+        self._num_free = capacity - before
+
+    def _rehash(self, more: int = 0) -> None:
+        """Make the table larger, with room for `more` cells, and leave out the cells that have no page to fill."""
+        used = int(np.count_nonzero(self._keys >= 0)) + more
+        keys: Int64 = np.full(max(len(self._keys), 1 << (4 * used).bit_length()), -1, np.int64)
+        tails: Int32 = np.full(len(keys), -1, np.int32)
+        filled = kernels.rehash(self._keys, self._tails, self.cells, keys, tails)
+        self._keys, self._tails, self._room = keys, tails, len(keys) // 2 - filled
+
+
+def _places(numbers: Int64) -> Int64:
+    """Return where in the pool the rows (ROWS, N) of surfels are."""
+    first = numbers // PAGE * SPAN + numbers % PAGE
+    return np.asarray(first + np.arange(ROWS)[:, None] * STRIDE)
+
+
+def _columns(capacity: int) -> dict[str, Array]:
+    """Return what is kept of so many pages and their shelves besides the surfels, where all are empty."""
+    boxes: Float32 = np.zeros((-(-capacity // SHELF), 6), np.float32)
+    boxes[:, :3], boxes[:, 3:] = 1e9, -1e9
+    return {
+        "counts": np.zeros(capacity, np.int32), "boxes": np.zeros((capacity, 6), np.float32), "shelves": boxes,
+        "cells": np.full(capacity, -1, np.int64), "probation": np.zeros(capacity, np.int32),
+        "dirty": np.zeros(capacity, np.uint8),
+    }  # fmt: skip
