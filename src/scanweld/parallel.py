@@ -87,6 +87,7 @@ _num_threads = max(
     1, min(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1, 16)
 )
 _pool: ThreadPoolExecutor | None = None
+_background: ThreadPoolExecutor | None = None
 _inside = threading.local()
 _limit: contextvars.ContextVar[int | None] = contextvars.ContextVar("scanweld_threads", default=None)
 
@@ -155,13 +156,21 @@ def run_ranges(count: int, body: Callable[[int, int], object], *, grain: int = 1
         future.result()
 
 
+def in_background(call: Callable[[], _One]) -> Future[_One]:
+    """Call on another thread; what it raises, the result does. Such calls take turns."""
+    global _background
+    if _background is None:
+        _background = ThreadPoolExecutor(max_workers=1, thread_name_prefix="scanweld-background")
+    return _background.submit(call)
+
+
 def _enter_pool() -> None:
     _inside.pool = True
 
 
 def _forget_pool() -> None:
-    global _pool
-    _pool = None
+    global _pool, _background
+    _pool = _background = None
 
 
 if hasattr(os, "register_at_fork"):  # threads do not survive a fork: a child would wait for its parent's

@@ -176,11 +176,9 @@ def is_seen_through(u, v, x, y, z, gate, margin, surface, width, height, transfo
     return depth < nearest - max(margin, np.float32(2) * gate)
 
 
-SURFACE, ALPHA, COLOR = np.uint64(0), np.uint64(8 * STRIDE), np.uint64(9 * STRIDE)
-"""Where the rows begin that `read_pixels` fills: eight of the surface, the weight, three of the colour."""
-
-SIGMA = np.uint64(6 * STRIDE)
-"""The row with one over the noise, zero where there is no surface."""
+SIGMA, ALPHA, COLOR = np.uint64(6 * STRIDE), np.uint64(8 * STRIDE), np.uint64(9 * STRIDE)
+"""Where rows of `read_pixels` begin: one over the noise, zero without a surface; the weight; three of the colour. The
+others of the surface are in their order (see `SurfaceLevel`)."""
 
 
 @kernel
@@ -190,8 +188,8 @@ def read_pixels(count, won, first, places, landed, surface, color, alpha, seen):
     The processor waits for memory, for as many pixels at once as it can see ahead: first come loops so short that it
     sees many.
     """
-    for k in range(count):
-        seen[SIGMA + k] = np.float32(0)
+    for place in range(count):
+        seen[SIGMA + place] = np.float32(0)
     for n in range(won):
         k, j = np.uint64(places[first + n]), np.uint64(landed[first + n]) * np.uint64(8)
         seen[SIGMA + k] = surface[j + np.uint64(6)]

@@ -19,8 +19,8 @@ from scanweld.mapping.surfel_map import SurfelMap
 class SurfelMapper:
     """Point-based fusion into a :class:`SurfelMap`.
 
-    Fusion looks at the map from the frame's pose anyway; what it saw is the view for the next frame, if that is
-    expected close by.
+    Fusion looks at the map from the frame's pose anyway; what it saw, `last_seen`, is the view for the next frame, if
+    that is expected close by; None when much was new.
     """
 
     def __init__(self, config: FusionConfig | None = None, storage: MapConfig | None = None) -> None:
@@ -28,13 +28,13 @@ class SurfelMapper:
         self.map = SurfelMap(config=storage)
         self._frames_fused = 0
         self._depth_buffers = DepthBuffers()
-        self._fused: ModelView | None = None
+        self.last_seen: ModelView | None = None
         self._reach_m = REACH_M
 
     def view(self, T_world_camera: Float64, camera: PinholeCamera) -> ModelView:
         """Return the map as a camera at `T_world_camera`, or within a few pixels of there, sees it."""
-        if self._fused is not None and _moved_share(self._fused, T_world_camera, camera) < SAME_VIEW_SHARE:
-            return self._fused
+        if self.last_seen is not None and shows_the_same(self.last_seen, T_world_camera, camera):
+            return self.last_seen
         candidates = find_candidates(self.map, T_world_camera, camera, far_m=self._reach_m)
         return render_model_view(
             self.map, candidates, T_world_camera, camera, self.config.stable_confidence, self._depth_buffers
@@ -55,7 +55,7 @@ class SurfelMapper:
             self.map, candidates, pyramid, T_world_camera, self._frames_fused, self.config, moving, self._depth_buffers
         )
         self._frames_fused += 1
-        self._fused = seen if counts.appended < MOSTLY_NEW * len(seen) else None
+        self.last_seen = seen if counts.appended < MOSTLY_NEW * len(seen) else None
         return counts
 
     def apply(self, correction: MapCorrection) -> None:
@@ -79,17 +79,18 @@ class SurfelMapper:
 
     def _merge(self, correction: MapCorrection) -> None:
         merge_doubled(self.map, correction, self.config.max_confidence, self.config.merging)
-        self._fused = None
+        self.last_seen = None
 
 
-def _moved_share(view: ModelView, T_world_camera: Float64, camera: PinholeCamera) -> float:
-    """How far the image has moved since a view, as a share of its width, where surfaces are not nearer than usual."""
+def shows_the_same(view: ModelView, T_world_camera: Float64, camera: PinholeCamera) -> bool:
+    """Whether a camera at `T_world_camera` sees nearly what a view shows: the image has moved by a small share."""
     if view.camera != camera:
-        return np.inf
+        return False
     motion = se3.inverse(view.T_world_camera) @ T_world_camera
     shift, turn = float(np.linalg.norm(motion[:3, 3])), float(se3.rotation_angle_rad(motion))
     # At the corners of the image a turn moves pixels by half as much again as in the middle.
-    return max(camera.fx, camera.fy) * (1.5 * turn + shift / TYPICAL_M) / camera.width
+    moved_px = max(camera.fx, camera.fy) * (1.5 * turn + shift / TYPICAL_M)
+    return moved_px < SAME_VIEW_SHARE * camera.width
 
 
 REACH_M, FURTHER = 12.0, 1.5
@@ -98,8 +99,9 @@ REACH_M, FURTHER = 12.0, 1.5
 TYPICAL_M = 1.0
 """Surfaces are mostly beyond this."""
 
-SAME_VIEW_SHARE = 0.05
-"""A view that moved by less than this share of the image shows nearly the same of the map."""
+SAME_VIEW_SHARE = 0.1
+"""A view that moved by less than this share of the image's width shows nearly the same of the map: what has come into
+sight since is missing on one side, and twice the share has shown no loss of accuracy (docs/decisions/0015)."""
 
 MOSTLY_NEW = 0.05
 """Where so many surfels were added, as a share of those seen, the map has to be looked at again."""

@@ -14,6 +14,7 @@ from scanweld.geometry.camera import PinholeCamera
 from scanweld.geometry.depth import intrinsics_array
 from scanweld.geometry.views import ModelView
 from scanweld.mapping import kernels
+from scanweld.mapping.storage.kernels import PAGE
 from scanweld.mapping.surfel_map import SurfelMap
 from scanweld.parallel import get_num_threads, run_ranges
 
@@ -109,7 +110,7 @@ def render_index_map(
     # More than four buffers cost more to clear and merge than their threads gain.
     parts = _even_shares(pages.counts[candidates], min(get_num_threads(), 4))
     buffers = depth_buffers.take(max(1, len(parts)), camera.shape)
-    landed = np.empty(len(candidates) * kernels.PAGE, np.int32)
+    landed = np.empty(len(candidates) * PAGE, np.int32)
     transform, intrinsics = _camera_arrays(T_world_camera, camera)
     stable = np.float32(stable_confidence)
 

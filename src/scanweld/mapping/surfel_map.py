@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from functools import partial
 
 import numpy as np
 
@@ -198,18 +199,9 @@ class SurfelMap:
         changed = [np.empty(0, np.int64)]
         for slots in pages.batches():
             moved: Bool = np.zeros(len(slots), np.bool_)
-
-            def body(start: int, stop: int, slots: Int64 = slots, moved: Bool = moved) -> None:
-                for k, slot in enumerate(slots[start:stop].tolist(), start):
-                    rows = pages.page(slot)
-                    anchors = np.minimum(rows[13].view(np.int32), len(table) - 1)
-                    if not moves[anchors].any():
-                        continue
-                    moved[k], T = True, table[anchors]
-                    rows[0:3] = np.einsum("nij,jn->in", T[:, :3, :3], rows[0:3]) + T[:, :3, 3].T
-                    rows[3:6] = np.einsum("nij,jn->in", T[:, :3, :3], rows[3:6])
-
-            run_ranges(len(slots), body)
+            run_ranges(
+                len(slots), partial(_move_pages, pages=pages, slots=slots, table=table, moves=moves, moved=moved)
+            )
             changed.append(slots[moved])
             pages.fit_boxes(changed[-1])
         pages.settle(np.concatenate(changed))
@@ -236,7 +228,7 @@ class SurfelMap:
         values: Array = np.empty((some.stop - some.start, len(self)), kind)
         done = 0
         for slots in self.pages.batches():
-            rows = self._rows(slots, some).view(kind)
+            rows: Array = self._rows(slots, some).view(kind)
             values[:, done : done + rows.shape[1]] = rows
             done += rows.shape[1]
         values = values if len(values) > 1 else values[0]
@@ -249,6 +241,21 @@ def motions(correction: MapCorrection) -> Float64:
     table = np.tile(np.eye(4), (int(correction.keyframe_ids.max(initial=0)) + 2, 1, 1))
     table[correction.keyframe_ids] = correction.T_new_old
     return table
+
+
+def _move_pages(start: int, stop: int, pages: PagePool, slots: Int64, table: Float64, moves: Bool, moved: Bool) -> None:
+    """Move the surfels of pages slots[start:stop] by the table of :func:`motions`, and note in `moved` which had any.
+
+    `moves` (A + 1,) : whether a keyframe moves at all
+    """
+    for k, slot in enumerate(slots[start:stop].tolist(), start):
+        rows = pages.page(slot)
+        anchors = np.minimum(rows[13].view(np.int32), len(table) - 1)
+        if not moves[anchors].any():
+            continue
+        moved[k], T = True, table[anchors]
+        rows[0:3] = np.einsum("nij,jn->in", T[:, :3, :3], rows[0:3]) + T[:, :3, 3].T
+        rows[3:6] = np.einsum("nij,jn->in", T[:, :3, :3], rows[3:6])
 
 
 def _file_columns(rows: Float32) -> dict[str, Array]:

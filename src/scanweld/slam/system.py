@@ -22,6 +22,8 @@ from scanweld.loop_closure.joining import Join
 from scanweld.loop_closure.loop_closer import KeyframeLoopCloser, LoopClosingConfig, NoLoopCloser
 from scanweld.mapping.fusion import FusionConfig
 from scanweld.mapping.mapper import SurfelMapper
+from scanweld.mapping.pipelined import PipelinedMapper
+from scanweld.mapping.storage.pages import MapConfig
 from scanweld.parallel import limited_threads
 from scanweld.refinement.config import RefinementConfig
 from scanweld.refinement.refine import Refinement, refine_keyframes
@@ -44,6 +46,7 @@ class SlamConfig:
     surfaces: SurfaceConfig = section(SurfaceConfig, "how depth becomes surfaces")
     tracking: TrackingConfig = section(TrackingConfig, "how a frame is aligned with the map")
     fusion: FusionConfig = section(FusionConfig, "how a frame is merged into the map")
+    map: MapConfig = section(MapConfig, "where the map is kept")
     health: HealthConfig = section(HealthConfig, "when a tracked pose is not believed")
     submaps: SubmapConfig = section(SubmapConfig, "when a lost camera begins a new map")
     dynamics: DynamicsConfig = section(DynamicsConfig, "what counts as moving, and is kept out of the map")
@@ -87,8 +90,10 @@ class Slam:
         self.loop_closer = loop_closer or NoLoopCloser()
         self.atlas = Atlas(mapper, self.loop_closer, submaps)
         self.surfaces = surfaces or SurfaceConfig()
-        self.results: list[FrameResult] = []
+        self._results: list[FrameResult] = []
+        self._num_surfels = 0  # after the last frame but one, or the last: see `_count`
         self._keyframes: list[int] = []  # that each result moves with
+        self._last_posed = -1  # the frame that the camera was last tracked in
         self._health = TrackingHealth(health)
         self._dynamics = MotionDetector(dynamics) if dynamics else None
         self._moving: Bool | None = None  # pixels (H, W) that move in the frame at hand
@@ -102,9 +107,15 @@ class Slam:
         return self.atlas.mapper
 
     @property
+    def results(self) -> list[FrameResult]:
+        """One per frame; each is of the submap that the camera was in."""
+        self._count()
+        return self._results
+
+    @property
     def map(self) -> Any:
         """The map of the main submap."""
-        return self.maps[main_submap(self.results)]
+        return self.maps[main_submap(self._results)]
 
     @property
     def maps(self) -> dict[int, Any]:
@@ -114,12 +125,12 @@ class Slam:
     @property
     def unjoined(self) -> tuple[int, ...]:
         """The submaps whose place in the world of the main one is not known."""
-        return tuple(submap for submap in self.atlas.mappers if submap != main_submap(self.results))
+        return tuple(submap for submap in self.atlas.mappers if submap != main_submap(self._results))
 
     @property
     def main_results(self) -> list[FrameResult]:
         """The results in the world of the main submap; frames of other submaps are LOST there."""
-        return in_one_world(self.results, main_submap(self.results))
+        return in_one_world(self.results, main_submap(self._results))
 
     @property
     def trajectory(self) -> Trajectory:
@@ -177,11 +188,12 @@ class Slam:
             moved = None
         if T_world_camera is not None:
             result = self._begun_anew(pyramid, self._placed(frame, T_world_camera))
-        elif len(self.mapper.map) == 0:
+        elif not self._has_map:
             result = self._first(pyramid, predicted)
         else:
             result = self._begun_anew(pyramid, self._tracked(pyramid, view, predicted, moved))
         clock.lap("track")
+        self._count()
         if result.state is not FrameState.LOST:  # a lost frame is never fused
             self.mapper.fuse(pyramid, result.T_world_camera, keyframe=self.loop_closer.keyframe, moving=self._moving)
             if self._dynamics:
@@ -191,24 +203,23 @@ class Slam:
             surely = result.status == Status.CONVERGED.value
             self._rotation.observe(frame.timestamp_s, result.T_world_camera, surely=surely)
             clock.lap("fuse")
-        elif len(self.mapper.map):
+        elif self._has_map:
             result = replace(result, T_world_camera=self._rotation.turn(self._motion.miss(frame.timestamp_s)))
-        result = self._keep(replace(result, num_surfels=len(self.mapper.map), stage_ms=clock.laps_ms))
+        result = self._keep(replace(result, stage_ms=clock.laps_ms))
         if result.state is not FrameState.LOST and T_world_camera is None:  # what was given is not corrected
             self._close_loops(pyramid if self._moving is None else leave_out(pyramid, self._moving), result)
             clock.lap("loop")
-        return self.results[-1]
+        return self._results[-1]
 
     def skip(self, timestamp_s: float, reason: str) -> FrameResult:
         """Note a frame that could not be read; its pose is the motion model's."""
         self._check_time(timestamp_s)
         return self._keep(
             FrameResult(
-                index=len(self.results),
+                index=len(self._results),
                 timestamp_s=timestamp_s,
                 state=FrameState.UNREADABLE,
-                T_world_camera=self._motion.miss(timestamp_s) if len(self.mapper.map) else self._T_world_first,
-                num_surfels=len(self.mapper.map),
+                T_world_camera=self._motion.miss(timestamp_s) if self._has_map else self._T_world_first,
                 note=reason,
             )
         )
@@ -228,9 +239,9 @@ class Slam:
         apply : move map and trajectory; without it the answer is only returned
         """
         database = getattr(self.loop_closer, "database", None)  # other loop closers may keep no keyframes
-        main = main_submap(self.results)
+        main = main_submap(self._results)
         everything = () if database is None else database.keyframes
-        keyframes = [keyframe for keyframe in everything if self.results[keyframe.frame_index].submap == main]
+        keyframes = [keyframe for keyframe in everything if self._results[keyframe.frame_index].submap == main]
         refined = refine_keyframes(keyframes, camera, config)
         if apply and refined.better and not refined.recalibrated and database is not None:
             poses = [keyframe.T_world_camera for keyframe in everything]
@@ -238,10 +249,10 @@ class Slam:
                 poses[index] = pose
             database.move(poses)
             self.atlas.mappers[main].apply(refined.correction)
-            moved = refined.corrections_at(np.array([result.timestamp_s for result in self.results]))
-            self.results = [
+            moved = refined.corrections_at(np.array([result.timestamp_s for result in self._results]))
+            self._results = [
                 replace(result, T_world_camera=T @ result.T_world_camera) if result.submap == main else result
-                for result, T in zip(self.results, moved, strict=True)
+                for result, T in zip(self._results, moved, strict=True)
             ]
         return refined
 
@@ -278,7 +289,7 @@ class Slam:
 
     def _lost_for(self) -> int:
         """Number of frames since the camera was last tracked."""
-        return next((n for n, r in enumerate(reversed(self.results)) if r.state in POSED), len(self.results))
+        return len(self._results) - 1 - self._last_posed
 
     def _found_again(self, pyramid: SurfacePyramid, predicted: Float64) -> FrameResult:
         """Look for a lost camera among the places that are known, and align it with the map there."""
@@ -309,11 +320,23 @@ class Slam:
 
     def _enter(self, submap: int) -> None:
         """Go on in another submap: what was usual, and how the camera moved, was in another world."""
+        self._count()
+        self._num_surfels = 0
         self.atlas.enter(submap)
         self._health, self._motion = TrackingHealth(self._health.config), ConstantVelocity()
         self._rotation.forget()
         if self._dynamics:
             self._dynamics.forget()
+
+    @property
+    def _has_map(self) -> bool:
+        return self._num_surfels > 0 or len(self.mapper.map) > 0
+
+    def _count(self) -> None:
+        """Note how large the map is after the last frame; a mapper that is still fusing it is waited for."""
+        if self._results and self._results[-1].submap == self.atlas.active:
+            self._num_surfels = len(self.mapper.map)
+            self._results[-1] = replace(self._results[-1], num_surfels=self._num_surfels)
 
     def _close_loops(self, pyramid: SurfacePyramid, result: FrameResult) -> None:
         """Let the loop closer look at a tracked frame, and do what follows."""
@@ -336,16 +359,16 @@ class Slam:
         T_other_here = aligned.T_target_source @ se3.inverse(result.T_world_camera)
         T = T_other_here if other == join.kept else se3.inverse(T_other_here)
         self._correct(self.atlas.join(replace(join, T_kept_joined=T)))
-        self.results = [replace(r, submap=join.kept) if r.submap == join.joined else r for r in self.results]
+        self._results = [replace(r, submap=join.kept) if r.submap == join.joined else r for r in self._results]
 
     def _correct(self, correction: MapCorrection) -> None:
         """Move the frames so far and the camera with their keyframes, as the map was."""
         if self._dynamics:
             self._dynamics.forget()
         moved = dict(zip(correction.keyframe_ids.tolist(), correction.T_new_old, strict=True))
-        self.results = [
+        self._results = [
             replace(result, T_world_camera=moved[keyframe] @ result.T_world_camera) if keyframe in moved else result
-            for result, keyframe in zip(self.results, self._keyframes, strict=True)
+            for result, keyframe in zip(self._results, self._keyframes, strict=True)
         ]
         now = moved.get(self.loop_closer.keyframe)
         if now is not None:
@@ -357,8 +380,7 @@ class Slam:
         seen = int(np.count_nonzero(pyramid.levels[0].surface[..., 6]))
         share = seen / pyramid.levels[0].depth_m.size
         # Frames at given poses may have left the map empty: the world is theirs then.
-        begun = any(result.state in POSED for result in self.results)
-        start = self._placed(pyramid.frame, predicted if begun else self._T_world_first)
+        start = self._placed(pyramid.frame, predicted if self._last_posed >= 0 else self._T_world_first)
         if share < MIN_FIRST_SHARE:
             return replace(
                 start, state=FrameState.LOST, note=f"no map yet, and only {share:.1%} of the depth is usable"
@@ -367,7 +389,7 @@ class Slam:
 
     def _placed(self, frame: Frame, T_world_camera: Float64) -> FrameResult:
         return FrameResult(
-            index=len(self.results),
+            index=len(self._results),
             timestamp_s=frame.timestamp_s,
             state=FrameState.TRACKING,
             T_world_camera=T_world_camera,
@@ -379,11 +401,11 @@ class Slam:
         lost = bool(doubt) or not aligned.status.has_pose
         if not lost:
             self._health.observe(aligned, predicted)
-        looked_at = (r.state for r in reversed(self.results) if r.state is not FrameState.UNREADABLE)
+        looked_at = (r.state for r in reversed(self._results) if r.state is not FrameState.UNREADABLE)
         was_lost = next(looked_at, None) is FrameState.LOST
         state = FrameState.LOST if lost else FrameState.RELOCALISED if was_lost else FrameState.TRACKING
         return FrameResult(
-            index=len(self.results),
+            index=len(self._results),
             timestamp_s=frame.timestamp_s,
             state=state,
             status=aligned.status.value,
@@ -398,14 +420,15 @@ class Slam:
     def _check_time(self, timestamp_s: float) -> None:
         if not math.isfinite(timestamp_s):
             raise InvalidInputError(f"frame: timestamp {timestamp_s} s is not a time")
-        if self.results and timestamp_s <= self.results[-1].timestamp_s:
+        if self._results and timestamp_s <= self._results[-1].timestamp_s:
             raise InvalidInputError(
-                f"frame: timestamp {timestamp_s:.6f} s does not follow {self.results[-1].timestamp_s:.6f} s"
+                f"frame: timestamp {timestamp_s:.6f} s does not follow {self._results[-1].timestamp_s:.6f} s"
             )
 
     def _keep(self, result: FrameResult) -> FrameResult:
-        result = replace(result, submap=self.atlas.active)
-        self.results.append(result)
+        result = replace(result, submap=self.atlas.active, num_surfels=self._num_surfels)
+        self._last_posed = len(self._results) if result.state in POSED else self._last_posed
+        self._results.append(result)
         self._keyframes.append(self.loop_closer.keyframe)
         return result
 
@@ -452,7 +475,7 @@ def build_slam(camera: PinholeCamera, config: SlamConfig | None = None, **stages
     config = config or SlamConfig()
     parts: dict[str, Any] = {
         "tracker": FrameToModelTracker(config.tracking),
-        "mapper": SurfelMapper(config.fusion),
+        "mapper": PipelinedMapper(SurfelMapper(config.fusion, config.map)),
         "loop_closer": KeyframeLoopCloser(config.loop_closing) if config.loop_closer == "keyframes" else NoLoopCloser(),
         "surfaces": config.surfaces,
         "health": config.health,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 
@@ -28,6 +28,9 @@ BATCHES = 4
 
 NEVER = 0x7FFFFFFF
 """Probation of a page without anything unstable."""
+
+SPARSE = PAGE // 4
+"""A page that is left with fewer surfels is given up."""
 
 _PER_CELL = np.float32(1 / CELL_M)
 
@@ -113,7 +116,15 @@ class PagePool:
     @property
     def resident_mb(self) -> float:
         """Memory that the pages take, counted by whole shelves [MB]."""
-        return 4e-6 * (self._residence.num_held * SHELF * SPAN if self._backing.paged else len(self.pool))
+        return self._memory_mb(self._residence.num_held)
+
+    @property
+    def most_resident_mb(self) -> float:
+        """The same, at most so far [MB]."""
+        return self._memory_mb(self._residence.most_held)
+
+    def _memory_mb(self, shelves: int) -> float:
+        return 4e-6 * (shelves * SHELF * SPAN if self._backing.paged else len(self.pool))
 
     def page(self, slot: int) -> Float32:
         """Return the rows (ROWS, count) of a page, a view."""
@@ -198,42 +209,33 @@ class PagePool:
         for first in np.unique(since[(after > 0) & (since < NEVER)]).tolist():
             self._waiting.setdefault(first, []).append(slots[(after > 0) & (since == first)].astype(np.int32))
         # Only now: where surfels go must not depend on what fitted into a batch.
-        for slot in slots[(after < before) & (after < PAGE // 4)].tolist():
-            self.shrink([(slot, self.page(slot).copy())])
+        self.give_up(slots[(after < before) & (after < SPARSE)])
         return int((before - after).sum())
-
-    def release(self, slot: int) -> None:
-        """Give a page back."""
-        self.total -= int(self.counts[slot])
-        self.counts[slot] = self.dirty[slot] = 0
-        self.cells[slot] = -1
-        self._free[self._num_free] = slot
-        self._num_free += 1
-
-    def shrink(self, pages: Sequence[tuple[int, Float32]]) -> None:
-        """Let pages hold `rows` (ROWS, count) each, not more than before; nearly empty ones are given up."""
-        homeless = []
-        for slot, rows in pages:
-            self.total -= int(self.counts[slot]) - rows.shape[1]
-            self.counts[slot] = rows.shape[1]
-            self.page(slot)[:] = rows
-            if rows.shape[1] < PAGE // 4:
-                self.release(slot)
-                homeless.append(rows)
-        for rows in homeless:  # only now: they may come into a page that was shrunk, too
-            self.add(rows)
 
     def drop(self, numbers: Int64) -> None:
         """Remove surfels."""
-        if len(numbers) == 0:
-            return
         gone = np.unique(numbers)
-        slots, first = np.unique(gone // PAGE, return_index=True)
+        slots = np.unique(gone // PAGE)
         self.use(slots)
-        self.shrink([
-            (slot, np.delete(self.page(slot), places % PAGE, axis=1))
-            for slot, places in zip(slots.tolist(), np.split(gone, first[1:]), strict=True)
-        ])  # fmt: skip
+        for slot, places in zip(slots.tolist(), np.split(gone, np.searchsorted(gone, slots[1:] * PAGE)), strict=False):
+            kept = np.delete(self.page(slot), places % PAGE, axis=1)
+            self.counts[slot] = kept.shape[1]
+            self.page(slot)[:] = kept
+        self.total -= len(gone)
+        self.give_up(slots[self.counts[slots] < SPARSE])
+
+    def give_up(self, slots: Int64) -> None:
+        """Give pages back; their surfels go to the pages that their cells fill now."""
+        if len(slots) == 0:
+            return
+        self.use(slots)
+        rows = self.rows(self.numbers_in(slots))
+        self.counts[slots] = self.dirty[slots] = 0
+        self.cells[slots] = -1
+        self._free[self._num_free : self._num_free + len(slots)] = slots
+        self._num_free += len(slots)
+        self.total -= rows.shape[1]
+        self.add(rows)
 
     def cull(self, planes: Float64) -> Int32:
         """Return the slots whose boxes are not wholly outside one of the planes (6, 4): n . x + d >= 0 is inside."""

@@ -26,6 +26,8 @@ class Residence:
         """Shelves that may be in memory."""
         self.num_held = 0
         """Shelves in memory."""
+        self.most_held = 0
+        """The same, at most so far."""
         self._turn = 0
         self._used: Int64 = np.empty(
             0, np.int64
@@ -49,6 +51,7 @@ class Residence:
             self._used[oldest] = -1
             self.num_held -= len(oldest)
             self._backing.let_go(self._ranges(oldest))
+        self.most_held = max(self.most_held, self.num_held)
         self._backing.recall(self._ranges(back))
 
     def _ranges(self, shelves: Array) -> list[tuple[int, int]]:
