@@ -229,7 +229,7 @@ STEP = np.array([0.006, 0.003, 0.0, 0.001, -0.002, 0.004])
 
 
 def along_wall(
-    count: int, step: np.ndarray = STEP, mode: str = "auto", **wall: object
+    count: int, step: np.ndarray = STEP, mode: str = "auto", first_seed: int = 0, **wall: object
 ) -> tuple[list[object], list[np.ndarray]]:
     """Track `count` frames of a camera that moves by a twist a frame before a wall; results and true poses."""
     slam = sw.build_slam(CAMERA, sw.SlamConfig(tracking=sw.TrackingConfig(photometry=mode)))
@@ -237,7 +237,9 @@ def along_wall(
     for k in range(count):
         swing = wall.get("gain_swing", 0.0) * np.sin(k / 3)
         options = {name: value for name, value in wall.items() if name != "gain_swing"}
-        slam.process(wall_frame(T, timestamp_s=k / 30, seed=k, gain=1 + swing, offset=-20 * swing, **options))
+        slam.process(
+            wall_frame(T, timestamp_s=k / 30, seed=first_seed + k, gain=1 + swing, offset=-20 * swing, **options)
+        )
         truth.append(T)
         T = T @ se3.exp(step)
     return slam.results, truth
@@ -257,24 +259,31 @@ class TestWalls:
 
     def test_blank_wall_is_degenerate_and_stays_at_the_prediction(self) -> None:
         """Nothing tells the slide of 5 cm: the first pose is the prediction, so are all others but for the noise of the
-        tilt, 0.2 mrad or 0.3 mm at the wall. Brightness changes no byte of it."""
-        slide = np.array([0.005, 0, 0, 0, 0, 0])
-        runs = [along_wall(12, slide, mode, textured=False)[0] for mode in ("auto", "off")]
-        for on, off in zip(runs[0][1:], runs[1][1:], strict=True):
-            assert on.status == "degenerate"
-            assert on.note.count("translation along") == 2
-            assert on.note.count("rotation about") == 1
-            assert np.linalg.norm(on.T_world_camera[:2, 3]) < 2e-3
-            assert on.note == off.note
-            assert on.T_world_camera.tobytes() == off.T_world_camera.tobytes()
+        tilt, 0.2 mrad or 0.3 mm at the wall. After 11 steps that is 2 mm, root mean square of 50 noises. Brightness
+        changes no byte of it."""
+        slide, drifts_m = np.array([0.005, 0, 0, 0, 0, 0]), []
+        for seed in (0, 40, 80, 120):
+            runs = [along_wall(12, slide, mode, seed, textured=False)[0] for mode in ("auto", "off")]
+            for on, off in zip(runs[0][1:], runs[1][1:], strict=True):
+                assert on.status == "degenerate"
+                assert on.note.count("translation along") == 2
+                assert on.note.count("rotation about") == 1
+                assert on.note == off.note
+                assert on.T_world_camera.tobytes() == off.T_world_camera.tobytes()
+            drifts_m.append(np.linalg.norm(runs[0][-1].T_world_camera[:2, 3]))
+        assert np.sqrt(np.mean(np.square(drifts_m))) < 3e-3
 
     def test_light_on_a_plain_wall_is_a_hint(self) -> None:
         """19 steps of 7 mm, 13 cm in all, from a first pose at rest: DEGENERATE all the while, and within 6 mm of the
-        truth, where without brightness the camera seems to stand still."""
-        results, truth = along_wall(20, textured=False, lit=True)
-        for result, T in zip(results[1:], truth[1:], strict=True):
-            assert result.status == "degenerate", result.note
-            assert pose_error(result.T_world_camera, T)[0] < 0.006
+        truth on average over noises, where without brightness the camera seems to stand still."""
+        furthest_m = []
+        for seed in (0, 40, 80, 120):
+            results, truth = along_wall(20, first_seed=seed, textured=False, lit=True)
+            assert {result.status for result in results[1:]} == {"degenerate"}
+            furthest_m.append(
+                max(pose_error(r.T_world_camera, T)[0] for r, T in zip(results[1:], truth[1:], strict=True))
+            )
+        assert np.mean(furthest_m) < 0.006
         blind, _ = along_wall(20, mode="off", textured=False, lit=True)
         assert pose_error(blind[-1].T_world_camera, truth[-1])[0] > 0.1
 

@@ -9,6 +9,7 @@ import pytest
 
 import scanweld as sw
 from rendered import CAMERA, rendered
+from scanweld.mapping.fusion import FusionConfig
 from scanweld.mapping.mapper import SurfelMapper
 from scanweld.mapping.pipelined import PipelinedMapper
 from scanweld.parallel import get_num_threads
@@ -18,12 +19,12 @@ class SlowMapper(SurfelMapper):
     """Waits until it may fuse."""
 
     def __init__(self) -> None:
-        super().__init__()
+        super().__init__(FusionConfig(stable_confidence=0.0))
         self.may_fuse = threading.Event()
         self.may_fuse.set()
 
     def fuse(self, *arguments: object, **options: object) -> object:
-        self.may_fuse.wait()
+        assert self.may_fuse.wait(10)
         return super().fuse(*arguments, **options)
 
 
@@ -72,6 +73,14 @@ class TestPipelined:
         seen = mapper.view(three[2][1], CAMERA)
         slow.may_fuse.set()
         assert seen is expected
+
+    def test_view_of_a_young_map_is_waited_for(self) -> None:
+        """Most of it is unstable, and changes much with each frame."""
+        mapper, plain = PipelinedMapper(SurfelMapper()), SurfelMapper()
+        for pyramid, T in frames(2):
+            mapper.fuse(pyramid, T)
+            plain.fuse(pyramid, T)
+            assert mapper.view(T, CAMERA).confidences.tobytes() == plain.view(T, CAMERA).confidences.tobytes()
 
     def test_view_is_the_same_whether_fusion_has_ended_or_not(self) -> None:
         views = []

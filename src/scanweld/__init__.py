@@ -82,7 +82,6 @@ if TYPE_CHECKING:
     from scanweld.slam.submaps import SubmapConfig
     from scanweld.slam.system import Slam, SlamConfig, build_slam
     from scanweld.tracking.dynamics import DynamicsConfig
-    from scanweld.tracking.rotation import RotationPrior
     from scanweld.tracking.tracker import FrameToModelTracker, TrackingConfig
     from scanweld.tracking.two_frames import TwoFrameConfig, align_frames
     from scanweld.trajectory import FrameResult, FrameState, Trajectory
@@ -135,7 +134,6 @@ _HOME = {
     "slam.health": ("HealthConfig",),
     "slam.system": ("Slam", "SlamConfig", "build_slam"),
     "tracking.dynamics": ("DynamicsConfig",),
-    "tracking.rotation": ("RotationPrior",),
     "tracking.tracker": ("FrameToModelTracker", "TrackingConfig"),
     "tracking.two_frames": ("TwoFrameConfig", "align_frames"),
     "datasets.gyroscope": ("Gyroscope",),
@@ -197,7 +195,6 @@ __all__ = [
     "RenderConfig",
     "RgbdSequence",
     "RobustAlignment",
-    "RotationPrior",
     "RunSummary",
     "ScanPair",
     "ScanweldError",

@@ -10,14 +10,13 @@ import numpy as np
 from scanweld.arrays import Bool, Float32, Float64, Int32
 from scanweld.config import check_ranges, section, setting
 from scanweld.geometry.camera import PinholeCamera
-from scanweld.geometry.depth import SurfacePyramid, as_kernel_input, intrinsics_array
+from scanweld.geometry.depth import SurfacePyramid, as_kernel_input
 from scanweld.geometry.views import ModelView
-from scanweld.mapping import kernels
+from scanweld.mapping.backends import backend
+from scanweld.mapping.backends.arrays import DepthBuffers, Measurement
 from scanweld.mapping.merging import MergingConfig
-from scanweld.mapping.rendering import DepthBuffers, as_view, render_index_map
-from scanweld.mapping.storage.kernels import ROWS
+from scanweld.mapping.rendering import as_view, render_index_map
 from scanweld.mapping.surfel_map import SurfelMap
-from scanweld.parallel import run_ranges
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -104,47 +103,17 @@ def fuse(
     alpha, moving = radial_weight(camera), NOTHING_MOVES if moving is None else as_kernel_input(moving, np.bool_)
     weights = alpha if moving is NOTHING_MOVES else np.where(moving, -alpha, alpha)
     weights.flags.writeable = False  # as `alpha` is: another kind of array would be another compilation
-    transform, intrinsics = T_world_camera[:3].astype(np.float32), intrinsics_array(camera)
-    parameters = np.array([
+    frame = Measurement(T_world_camera, camera, surface, color, weights, moving, frame_id)
+    limits = np.array([
         config.gate_sigma, config.gate_floor_m, config.min_cosine, config.free_space_margin_m, config.spread_pixels,
         config.max_confidence,
     ], np.float32)  # fmt: skip
     seen = render_index_map(surfels, candidates, T_world_camera, camera, config.stable_confidence, depth_buffers)
-    pages = surfels.pages
-    merged = np.zeros(camera.shape, np.uint8)
-    pending, counts = np.empty(camera.shape, np.int32), np.empty(camera.height, np.int32)
-
-    offsets, shown, values = seen.room()
-
-    def merge(start: int, stop: int) -> None:
-        kernels.merge_pages(
-            start, stop, seen.slots, pages.counts, seen.places, seen.pixels, seen.won, offsets, surface.reshape(-1),
-            color.reshape(-1), weights.reshape(-1), transform, parameters, camera.width, camera.height, frame_id,
-            pages.pool, pages.whole, pages.dirty, merged.reshape(-1), shown.reshape(-1), values,
-        )  # fmt: skip
-
-    def cover(start: int, stop: int) -> None:
-        kernels.cover_rows(
-            start, stop, shown, values, merged, surface.reshape(-1), moving, transform, intrinsics, parameters, pending,
-            counts,
-        )  # fmt: skip
-
-    run_ranges(len(seen.slots), merge)
-    run_ranges(camera.height, cover)
-    firsts = np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
-    new, anchor = int(firsts[-1]), surfels.anchor
-    rows = np.empty((ROWS, new), np.float32)
-    whole = rows.view(np.int32)
-
-    def make(start: int, stop: int) -> None:
-        kernels.new_surfels(
-            start, stop, pending, counts, firsts, surface, color, alpha, transform, frame_id, anchor, rows, whole
-        )
-
-    run_ranges(camera.height, make)
-    pages.add(rows)
-    counted = FusionCounts(new, tidy(surfels, frame_id, config))
-    return counted, as_view(shown, values, T_world_camera, camera, config.stable_confidence)
+    merged, rows, values = backend().merge(surfels.pages, seen, frame, limits)
+    new = backend().new_surfels(rows, values, merged, frame, limits, surfels.anchor)
+    surfels.pages.add(new)
+    counted = FusionCounts(new.shape[1], tidy(surfels, frame_id, config))
+    return counted, as_view(rows, values, T_world_camera, camera, config.stable_confidence)
 
 
 def tidy(surfels: SurfelMap, frame_id: int, config: FusionConfig) -> int:

@@ -9,9 +9,10 @@ from scanweld.geometry import se3
 from scanweld.geometry.camera import PinholeCamera
 from scanweld.geometry.depth import SurfacePyramid
 from scanweld.geometry.views import MapCorrection, ModelView
+from scanweld.mapping.backends.arrays import DepthBuffers
 from scanweld.mapping.fusion import FusionConfig, FusionCounts, fuse
 from scanweld.mapping.merging import merge_doubled
-from scanweld.mapping.rendering import DepthBuffers, find_candidates, render_model_view
+from scanweld.mapping.rendering import find_candidates, render_model_view
 from scanweld.mapping.storage.pages import MapConfig
 from scanweld.mapping.surfel_map import SurfelMap
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 from concurrent.futures import Future, wait
 from typing import Any
 
+import numpy as np
+
 from scanweld.arrays import Bool, Float64
 from scanweld.geometry.camera import PinholeCamera
 from scanweld.geometry.depth import SurfacePyramid
@@ -60,7 +62,7 @@ class PipelinedMapper:
     ) -> None:
         """Begin to merge a frame into the map, as :meth:`SurfelMapper.fuse` does; waits for the one before."""
         mapper = self.settled
-        self._seen = mapper.last_seen
+        self._seen = mapper.last_seen if _is_settled(mapper.last_seen) else None
         threads = get_num_threads()
 
         def fuse() -> None:
@@ -85,3 +87,8 @@ class PipelinedMapper:
         """Add the map of another mapper, moved with its keyframes."""
         self._seen = None
         self.settled.take_in(other.settled, correction)
+
+
+def _is_settled(view: ModelView | None) -> bool:
+    """Whether most of a view is stable: what is younger changes from frame to frame, and is worth waiting for."""
+    return view is not None and 2 * np.count_nonzero(view.confidences >= view.stable_confidence) > len(view)

@@ -127,7 +127,7 @@ class SurfelMap:
     def batches(self) -> Iterator[dict[str, Array]]:
         """Yield :meth:`columns` in parts, in order; with a memory budget none of them is larger."""
         for slots in self.pages.batches():
-            yield _file_columns(self._rows(slots))
+            yield _file_columns(self.pages.rows_in(slots))
 
     def sample(self, count: int) -> dict[str, Array]:
         """Return about `count` surfels from all over the map, in the form of :meth:`columns`; all of a smaller one."""
@@ -168,7 +168,7 @@ class SurfelMap:
     def take_in(self, other: SurfelMap) -> None:
         """Add the surfels of another map in the same world, as they are: their keyframes and ages stay theirs."""
         for slots in other.pages.batches():
-            self.pages.add(other._rows(slots))
+            self.pages.add(other.pages.rows_in(slots))
 
     def remove(self, doomed: Bool) -> int:
         """Drop the surfels where `doomed` (N,) is true; returns how many went."""
@@ -213,22 +213,12 @@ class SurfelMap:
             rows[some] = np.asarray(table[name]).astype(kind).view(np.float32)
         self.pages.add(rows)
 
-    def _rows(self, slots: Int64, some: slice = slice(0, ROWS)) -> Float32:
-        """Return some rows of pages (R, N), a copy."""
-        rows = np.empty((some.stop - some.start, int(self.pages.counts[slots].sum())), np.float32)
-        done = 0
-        for slot in slots.tolist():
-            page = self.pages.page(slot)
-            rows[:, done : done + page.shape[1]] = page[some]
-            done += page.shape[1]
-        return rows
-
     def _column(self, name: str) -> Array:
         some, kind = _ROWS[name]
         values: Array = np.empty((some.stop - some.start, len(self)), kind)
         done = 0
         for slots in self.pages.batches():
-            rows: Array = self._rows(slots, some).view(kind)
+            rows: Array = self.pages.rows_in(slots, some).view(kind)
             values[:, done : done + rows.shape[1]] = rows
             done += rows.shape[1]
         values = values if len(values) > 1 else values[0]

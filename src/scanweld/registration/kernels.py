@@ -1,8 +1,9 @@
 """Compiled kernels of the projective aligner.
 
-Blocks of points are projected, compacted to those that land in the image, turned into rows (six Jacobian columns,
-residual, weight), and the rows are added to the normal equations. Every residual only fills rows; the linear algebra
-is written once.
+Blocks of points are moved and projected, what their pixels hold is gathered, and both are turned into rows (Jacobian
+columns, residual, weight) that are added to the normal equations. Every residual only fills rows; the linear algebra is
+written once. All but the gathering is vectorised: what does not count has the weight zero, and a block's arrays are
+flat, with their rows a fixed distance apart, or the compiler could not tell that they do not overlap.
 """
 
 from __future__ import annotations
@@ -14,94 +15,118 @@ from scanweld.parallel import kernel
 BLOCK = 512
 """Points handled at a time: their rows stay in the first-level cache."""
 
+ROW = np.uint64(BLOCK)
+"""Distance of the rows of a block's arrays."""
+
 CHUNK = 8192
 """Points whose sums share one row of float64 partial sums; fixed, so that sums do not depend on the threads."""
+
+COLUMNS = 7
+"""Six of the motion, residual."""
 
 SUMS = 32
 """Partial sums: 28 products of the columns (J, r), then loss, inliers, matched, projected."""
 
 
 @kernel
-def project_block(first, count, positions, transform, intrinsics, width, height, moved, pixels):
-    """Move `count` points and project them; keep those in the image. Returns how many were kept.
+def project_block(first, count, positions, normals, transform, intrinsics, width, height, moved, pixels):
+    """Move `count` points and their normals and project them; returns how many are in the image.
 
-    moved (4, BLOCK): x, y, z in the target frame and the index of the point; pixels (BLOCK,): row-major pixel.
+    moved (6 * BLOCK,): positions and normals in the target frame; pixels (BLOCK,) int32: row-major, -1 outside.
     """
-    kept = 0
+    half, zero, near = np.float32(0.5), np.float32(0), np.float32(1e-3)
     fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
-    half = np.float32(0.5)
-    right, bottom = np.float32(width), np.float32(height)
-    for k in range(count):
-        i = first + k
+    r00, r01, r02, t0 = transform[0, 0], transform[0, 1], transform[0, 2], transform[0, 3]
+    r10, r11, r12, t1 = transform[1, 0], transform[1, 1], transform[1, 2], transform[1, 3]
+    r20, r21, r22, t2 = transform[2, 0], transform[2, 1], transform[2, 2], transform[2, 3]
+    right, bottom, columns = np.float32(width), np.float32(height), np.int32(width)
+    kept = np.int32(0)
+    for k in range(np.uint64(count)):
+        i = np.uint64(first) + k
         x, y, z = positions[0, i], positions[1, i], positions[2, i]
-        xc = transform[0, 0] * x + transform[0, 1] * y + transform[0, 2] * z + transform[0, 3]
-        yc = transform[1, 0] * x + transform[1, 1] * y + transform[1, 2] * z + transform[1, 3]
-        zc = transform[2, 0] * x + transform[2, 1] * y + transform[2, 2] * z + transform[2, 3]
-        inverse = np.float32(1) / max(zc, np.float32(1e-6))
+        a, b, c = normals[0, i], normals[1, i], normals[2, i]
+        xc = r00 * x + r01 * y + r02 * z + t0
+        yc = r10 * x + r11 * y + r12 * z + t1
+        zc = r20 * x + r21 * y + r22 * z + t2
+        inverse = np.float32(1) / max(zc, near)
         u = fx * xc * inverse + cx + half
         v = fy * yc * inverse + cy + half
-        inside = (zc > np.float32(1e-3)) & (u >= 0) & (u < right) & (v >= 0) & (v < bottom)
-        # Written always, counted only when inside: no branch to mispredict.
-        moved[0, kept], moved[1, kept], moved[2, kept], moved[3, kept] = xc, yc, zc, np.float32(k)
-        pixels[kept] = (np.int64(v) * width + np.int64(u)) if inside else 0
-        kept += 1 if inside else 0
+        inside = (zc > near) & (u >= zero) & (u < right) & (v >= zero) & (v < bottom)
+        moved[k], moved[k + ROW], moved[k + np.uint64(2) * ROW] = xc, yc, zc
+        moved[k + np.uint64(3) * ROW] = r00 * a + r01 * b + r02 * c
+        moved[k + np.uint64(4) * ROW] = r10 * a + r11 * b + r12 * c
+        moved[k + np.uint64(5) * ROW] = r20 * a + r21 * b + r22 * c
+        column, row = np.int32(min(max(u, zero), right)), np.int32(min(max(v, zero), bottom))
+        pixels[k] = row * columns + column if inside else np.int32(-1)
+        kept += np.int32(1) if inside else np.int32(0)
     return kept
 
 
 @kernel
-def point_to_plane_rows(first, kept, moved, pixels, normals, transform, target, gate, min_cosine, robust, rows, sums):
-    """Fill rows (8, BLOCK) with J, r, w of the accepted correspondences; returns how many.
+def gather_surface(count, pixels, target, surface):
+    """Gather what the pixels hold: surface (7 * BLOCK,) vertex, normal, one over the noise; zero where there is none.
+
+    target (H * W, 8) float32, see `SurfaceLevel.surface`.
+    """
+    for k in range(np.uint64(count)):
+        j = np.uint64(max(pixels[k], np.int32(0)))
+        a, b, c, d = target[j, 0], target[j, 1], target[j, 2], target[j, 3]
+        e, f, s = target[j, 4], target[j, 5], target[j, 6]
+        surface[k], surface[k + ROW], surface[k + np.uint64(2) * ROW] = a, b, c
+        surface[k + np.uint64(3) * ROW], surface[k + np.uint64(4) * ROW] = d, e
+        surface[k + np.uint64(5) * ROW] = f
+        surface[k + np.uint64(6) * ROW] = s if pixels[k] >= 0 else np.float32(0)
+
+
+@kernel
+def point_to_plane_rows(count, moved, surface, gate, min_cosine, robust, rows, sums):
+    """Fill rows (8 * BLOCK,) with J, r, w of the correspondences; those that are not accepted weigh nothing.
 
     r = n . (p - q) with q, n the target's vertex and normal (Chen and Medioni 1991), J = [n, p x n]; both in units of
     the depth noise at q. The weight is Huber's.
     """
-    matched = 0
+    one, zero, half = np.float32(1), np.float32(0), np.float32(0.5)
     squared_gate = gate * gate
-    for k in range(kept):
-        q = target[pixels[k]]
-        x, y, z = moved[0, k], moved[1, k], moved[2, k]
-        dx, dy, dz = x - q[0], y - q[1], z - q[2]
-        nx, ny, nz = q[3], q[4], q[5]
-        i = first + np.int64(moved[3, k])
-        a, b, c = normals[0, i], normals[1, i], normals[2, i]
-        cosine = (
-            nx * (transform[0, 0] * a + transform[0, 1] * b + transform[0, 2] * c)
-            + ny * (transform[1, 0] * a + transform[1, 1] * b + transform[1, 2] * c)
-            + nz * (transform[2, 0] * a + transform[2, 1] * b + transform[2, 2] * c)
-        )
-        s = q[6]
-        accept = (s > 0) & (dx * dx + dy * dy + dz * dz < squared_gate) & (cosine > min_cosine)
+    loss, inliers, matched = zero, zero, zero
+    for k in range(np.uint64(count)):
+        x, y, z = moved[k], moved[k + ROW], moved[k + np.uint64(2) * ROW]
+        a, b, c = moved[k + np.uint64(3) * ROW], moved[k + np.uint64(4) * ROW], moved[k + np.uint64(5) * ROW]
+        dx, dy, dz = x - surface[k], y - surface[k + ROW], z - surface[k + np.uint64(2) * ROW]
+        nx, ny = surface[k + np.uint64(3) * ROW], surface[k + np.uint64(4) * ROW]
+        nz, s = surface[k + np.uint64(5) * ROW], surface[k + np.uint64(6) * ROW]
+        cosine = nx * a + ny * b + nz * c
+        accept = (s > zero) & (dx * dx + dy * dy + dz * dz < squared_gate) & (cosine > min_cosine)
         r = (nx * dx + ny * dy + nz * dz) * s
-        rows[0, matched], rows[1, matched], rows[2, matched] = nx * s, ny * s, nz * s
-        rows[3, matched] = (y * nz - z * ny) * s
-        rows[4, matched] = (z * nx - x * nz) * s
-        rows[5, matched] = (x * ny - y * nx) * s
-        rows[6, matched] = r
-        matched += 1 if accept else 0
-    inliers = np.float32(0)
-    loss = np.float32(0)
-    for k in range(matched):
-        size = abs(rows[6, k])
-        inside = size <= robust
-        rows[7, k] = np.float32(1) if inside else robust / size
-        loss += np.float32(0.5) * size * size if inside else robust * (size - np.float32(0.5) * robust)
-        inliers += np.float32(1) if inside else np.float32(0)
+        size = abs(r)
+        weight = min(robust / max(size, np.float32(1e-12)), one)
+        counted = one if accept else zero
+        loss += counted * weight * size * (size - half * weight * size)
+        inliers += counted if size <= robust else zero
+        matched += counted
+        nx, ny, nz = nx * s, ny * s, nz * s
+        rows[k], rows[k + ROW], rows[k + np.uint64(2) * ROW] = nx, ny, nz
+        rows[k + np.uint64(3) * ROW], rows[k + np.uint64(4) * ROW] = y * nz - z * ny, z * nx - x * nz
+        rows[k + np.uint64(5) * ROW], rows[k + np.uint64(6) * ROW] = x * ny - y * nx, r
+        rows[k + np.uint64(7) * ROW] = counted * weight
     sums[28] += loss
     sums[29] += inliers
     sums[30] += matched
-    sums[31] += kept
-    return matched
 
 
 @kernel
-def accumulate(rows, count, sums):
-    """Add the weighted products of the seven columns (J, r) of `count` rows to sums[0:28], upper triangle."""
+def accumulate(rows, columns, count, weighted, sums):
+    """Add the weighted products of the columns of `count` rows to the first of `sums`, upper triangle.
+
+    rows ((columns + 1) * BLOCK,), the weights last; weighted (BLOCK,) is overwritten.
+    """
     entry = 0
-    for a in range(7):
-        for b in range(a, 7):
+    for a in range(np.uint64(columns)):
+        for k in range(np.uint64(count)):
+            weighted[k] = rows[k + np.uint64(columns) * ROW] * rows[k + a * ROW]
+        for b in range(a, np.uint64(columns)):
             total = np.float32(0)
-            for k in range(count):
-                total += rows[7, k] * rows[a, k] * rows[b, k]
+            for k in range(np.uint64(count)):
+                total += weighted[k] * rows[k + b * ROW]
             sums[entry] += total
             entry += 1
 
@@ -128,16 +153,17 @@ def point_to_plane_sums(
     positions, normals (3, N) float32 in the source frame; transform (3, 4) float32 source -> target; target
     (H * W, 8) float32, see `SurfaceLevel.surface`; gate [m]; robust: Huber's threshold in standard deviations.
     """
-    moved = np.empty((4, BLOCK), np.float32)
-    pixels = np.empty(BLOCK, np.int64)
-    rows = np.empty((8, BLOCK), np.float32)
+    moved, pixels = np.empty(6 * BLOCK, np.float32), np.empty(BLOCK, np.int32)
+    surface, rows = np.empty(7 * BLOCK, np.float32), np.empty((COLUMNS + 1) * BLOCK, np.float32)
+    weighted = np.empty(BLOCK, np.float32)
     for part in range(start, stop):
         sums = partials[part]
         sums[:] = 0.0
         for first in range(bounds[part], bounds[part + 1], BLOCK):
             count = min(BLOCK, bounds[part + 1] - first)
-            kept = project_block(first, count, positions, transform, intrinsics, width, height, moved, pixels)
-            matched = point_to_plane_rows(
-                first, kept, moved, pixels, normals, transform, target, gate, min_cosine, robust, rows, sums
+            sums[31] += project_block(
+                first, count, positions, normals, transform, intrinsics, width, height, moved, pixels
             )
-            accumulate(rows, matched, sums)
+            gather_surface(count, pixels, target, surface)
+            point_to_plane_rows(count, moved, surface, gate, min_cosine, robust, rows, sums)
+            accumulate(rows, COLUMNS, count, weighted, sums)

@@ -14,9 +14,9 @@ import numpy as np
 from scanweld.arrays import Float32, Float64
 from scanweld.config import check_ranges, setting
 from scanweld.geometry import se3
-from scanweld.geometry.depth import SurfaceLevel, intrinsics_array
-from scanweld.parallel import run_ranges
+from scanweld.geometry.depth import SurfaceLevel
 from scanweld.registration import kernels
+from scanweld.registration.backends import backend
 from scanweld.registration.gauss_newton import (
     NormalEquations,
     Spectrum,
@@ -148,25 +148,15 @@ def _partial_sums(
     config: ProjectiveConfig,
     parts: int | None = None,
 ) -> Float64:
-    """Return the sums (K, SUMS) of contiguous shares of the points, see :func:`~.kernels.point_to_plane_sums`."""
+    """Return the sums (K, SUMS) of contiguous shares of the points, see :class:`~.backends.ProjectiveBackend`."""
     count = positions_m.shape[1]
     if parts is None:
         bounds = np.append(np.arange(0, count, kernels.CHUNK), count)
     else:
         bounds = np.linspace(0, count, parts + 1).astype(np.int64)
-    partials = np.empty((len(bounds) - 1, kernels.SUMS))
-    transform, intrinsics = T_target_source[:3].astype(np.float32), intrinsics_array(target.camera)
-    height, width = target.camera.shape
-    surface = target.surface.reshape(-1, 8)
-    limits = np.float32(gate_m), np.float32(config.min_cosine), np.float32(config.robust_sigma)
-
-    def body(start: int, stop: int) -> None:
-        kernels.point_to_plane_sums(
-            start, stop, bounds, positions_m, normals, transform, surface, intrinsics, width, height, *limits, partials
-        )
-
-    run_ranges(len(partials), body)
-    return partials
+    return backend().point_to_plane_sums(
+        positions_m, normals, T_target_source, target, bounds, gate_m, config.min_cosine, config.robust_sigma
+    )
 
 
 def _as_equations(partials: Float64) -> GeometricSums:

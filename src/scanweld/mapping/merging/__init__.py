@@ -15,7 +15,6 @@ from scanweld.config import check_ranges, setting
 from scanweld.geometry import se3
 from scanweld.geometry.views import MapCorrection
 from scanweld.mapping.merging import kernels
-from scanweld.mapping.storage.kernels import PAGE
 from scanweld.mapping.surfel_map import SurfelMap, motions
 
 _COSINE = 0.7
@@ -66,7 +65,8 @@ def merge_doubled(
     keys = _cells(rows[:3].astype(np.float64), side)
     order = np.argsort(keys, kind="stable")
     numbers, keys, rows = numbers[order], keys[order], rows[:, order]
-    cells, cell_of = np.unique(keys, return_inverse=True)
+    begins = np.diff(keys, prepend=-1) != 0
+    cells, cell_of = keys[begins], np.cumsum(begins) - 1
     p, n, c, r, weights = rows[0:3], rows[3:6], rows[8:11], rows[7], rows[6]
     fineness = np.floor(np.log(np.maximum(r, 1e-6)) / np.log(_RADIUS_CLASS))
     ranking = np.lexsort((-weights, fineness)).astype(np.int64)
@@ -75,10 +75,10 @@ def merge_doubled(
     taken: Bool = np.zeros(len(numbers), np.bool_)
     limits = np.array([config.distance_m, _COSINE, most], np.float32)
     kernels.merge_layers(
-        ranking, rank, cell_of.astype(np.int64).ravel(), _around(cells, keys), p, n, c, r, weights,
+        ranking, rank, cell_of, _around(cells, keys), p, n, c, r, weights,
         rows[13].view(np.int32), config.gap, limits, taken,
     )  # fmt: skip
-    slots = np.unique(numbers // PAGE)
+    slots = pages.slots_of(numbers)
     pages.use(slots)
     pages.put(numbers, rows)
     pages.fit_boxes(slots)
@@ -91,31 +91,27 @@ def _brought_together(surfels: SurfelMap, correction: MapCorrection, gap: int) -
     """Return the numbers of the surfels in areas that more than one pass saw, and that moved in different ways."""
     pages, T_old_new = surfels.pages, se3.inverse(motions(correction))
 
-    def looked_at(slots: Int64) -> tuple[Int64, Int64, Float32]:
-        numbers = pages.numbers_in(slots)
-        rows = pages.rows(numbers)
-        return numbers, _areas(rows[:3]), rows
-
     # Of each area (A,), from all batches: its key, and the least and the largest anchor and motion (4, A) there.
     found: tuple[Int64, Float64, Float64] = np.empty(0, np.int64), np.empty((4, 0)), np.empty((4, 0))
     for slots in pages.batches():
-        _, keys, rows = looked_at(slots)
-        anchors = rows[13].view(np.int32)
+        positions, anchors = pages.rows_in(slots, slice(0, 3)), pages.rows_in(slots, slice(13, 14))[0].view(np.int32)
         T = T_old_new[np.minimum(anchors, len(T_old_new) - 1)]
-        moved = rows[:3] - np.einsum("nij,jn->in", T[:, :3, :3], rows[:3]) - T[:, :3, 3].T
+        moved = positions - np.einsum("nij,jn->in", T[:, :3, :3], positions) - T[:, :3, 3].T
         values = np.concatenate([anchors[None], moved])
+        keys, least, largest = _by_area(_areas(positions), values, values)
         found = _by_area(
             np.concatenate([found[0], keys]),
-            np.concatenate([found[1], values], axis=1),
-            np.concatenate([found[2], values], axis=1),
+            np.concatenate([found[1], least], axis=1),
+            np.concatenate([found[2], largest], axis=1),
         )
     areas, least, largest = found
     apart = (largest - least)[1:].max(axis=0, initial=0.0)
     areas = areas[((largest - least)[0] >= gap) & (apart > _MOVED_M)]
     chosen = [np.empty(0, np.int64)]
     for slots in pages.batches() if len(areas) else ():
-        numbers, keys, _ = looked_at(slots)
-        chosen.append(numbers[np.isin(keys, areas)])
+        keys = _areas(pages.rows_in(slots, slice(0, 3)))
+        near = np.minimum(np.searchsorted(areas, keys), len(areas) - 1)
+        chosen.append(pages.numbers_in(slots)[areas[near] == keys])
     return np.concatenate(chosen)
 
 

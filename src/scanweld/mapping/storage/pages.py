@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 
-from scanweld.arrays import Array, Float32, Float64, Int32, Int64, UInt8
+from scanweld.arrays import Array, Bool, Float32, Float64, Int32, Int64, UInt8
 from scanweld.config import check_ranges, setting
 from scanweld.mapping.storage import kernels
 from scanweld.mapping.storage.backing import MappedFile, Memory
@@ -23,11 +23,14 @@ is fifty pixels wide, so that what is read of the image for a page stays in the 
 BOX_TURNS = 64
 """Looks at the map after which the box of each page in view is brought up to date."""
 
-BATCHES = 4
-"""Parts of the memory budget, one of which a batch of pages takes: others hold what is made of it."""
+BATCH_SHELVES = 64
+"""Shelves of a batch, a million surfels: what is made of it should not take much memory either."""
 
 NEVER = 0x7FFFFFFF
 """Probation of a page without anything unstable."""
+
+FEWEST_CELLS = 16
+"""Room of the table of cells at first, a power of two: half of it may be taken."""
 
 SPARSE = PAGE // 4
 """A page that is left with fewer surfels is given up."""
@@ -42,7 +45,7 @@ class MapConfig:
     memory_budget_mb: float = setting(
         0.0,
         "memory for surfels [MB]; what was not in view lately waits on disk, results stay the same. 0 keeps all in "
-        "memory; set it for recordings of hours, 17 million surfels take a gigabyte",
+        "memory; set it for recordings of hours, about 14 million surfels take a gigabyte",
         low=0.0,
     )
     folder: str = setting(
@@ -81,8 +84,8 @@ class PagePool:
         self._residence = Residence(self._backing, SHELF * SPAN, int(budget * 1e6 / 4))
         self._looks = 0
         self._waiting: dict[int, list[Int32]] = {}
-        self._keys: Int64 = np.full(1 << 10, -1, np.int64)
-        self._tails: Int32 = np.full(1 << 10, -1, np.int32)
+        self._keys: Int64 = np.full(FEWEST_CELLS, -1, np.int64)
+        self._tails: Int32 = np.full(FEWEST_CELLS, -1, np.int32)
         self._room = len(self._keys) // 2
         for name, values in _columns(0).items():
             setattr(self, name, values)
@@ -136,12 +139,16 @@ class PagePool:
             self._residence.use(np.unique(slots // SHELF))
 
     def batches(self, slots: Array | None = None) -> Iterator[Array]:
-        """Yield slots, by default those of all pages with surfels, in parts that fit the budget; each is in memory."""
+        """Yield slots, by default those of all pages with surfels, in parts of which four fit the budget.
+
+        The pages of a part are in memory while it is looked at.
+        """
         slots = self.live if slots is None else slots
         if len(slots) == 0:
             return
         shelf = np.cumsum(np.diff(slots // SHELF, prepend=slots[0] // SHELF) != 0)
-        part = shelf // max(1, self._residence.room // BATCHES) if self._backing.paged else np.zeros(len(slots))
+        size = min(BATCH_SHELVES, self._residence.room // 4) if self._backing.paged else BATCH_SHELVES
+        part = shelf // max(1, size)
         for some in np.split(slots, np.flatnonzero(np.diff(part)) + 1):
             self.use(some)
             yield some
@@ -151,6 +158,22 @@ class PagePool:
         counts = self.counts[slots].astype(np.int64)
         first = np.cumsum(counts) - counts
         return np.asarray(np.repeat(slots * np.int64(PAGE) - first, counts) + np.arange(int(counts.sum())))
+
+    def slots_of(self, numbers: Array) -> Int64:
+        """Return the slots, in order, of the pages that surfels are in."""
+        held: Bool = np.zeros(self.capacity, np.bool_)
+        held[numbers // PAGE] = True
+        return np.flatnonzero(held)
+
+    def rows_in(self, slots: Array, some: slice = slice(0, ROWS)) -> Float32:
+        """Return some rows of the surfels of pages (R, N), page by page."""
+        rows: Float32 = np.empty((some.stop - some.start, int(self.counts[slots].sum())), np.float32)
+        done = 0
+        for slot in slots.tolist():
+            page = self.page(slot)
+            rows[:, done : done + page.shape[1]] = page[some]
+            done += page.shape[1]
+        return rows
 
     def rows(self, numbers: Int64) -> Float32:
         """Return the rows (ROWS, N) of surfels."""
@@ -213,9 +236,8 @@ class PagePool:
         return int((before - after).sum())
 
     def drop(self, numbers: Int64) -> None:
-        """Remove surfels."""
-        gone = np.unique(numbers)
-        slots = np.unique(gone // PAGE)
+        """Remove surfels, each named once."""
+        gone, slots = np.sort(numbers), self.slots_of(numbers)
         self.use(slots)
         for slot, places in zip(slots.tolist(), np.split(gone, np.searchsorted(gone, slots[1:] * PAGE)), strict=False):
             kept = np.delete(self.page(slot), places % PAGE, axis=1)
@@ -229,7 +251,7 @@ class PagePool:
         if len(slots) == 0:
             return
         self.use(slots)
-        rows = self.rows(self.numbers_in(slots))
+        rows = self.rows_in(slots)
         self.counts[slots] = self.dirty[slots] = 0
         self.cells[slots] = -1
         self._free[self._num_free : self._num_free + len(slots)] = slots
