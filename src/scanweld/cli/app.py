@@ -16,15 +16,19 @@ from typing import Annotated, Any
 import typer
 
 from scanweld.cli.bench import bench
+from scanweld.cli.completion import completion
 from scanweld.cli.config import config
 from scanweld.cli.datasets import datasets
 from scanweld.cli.demo import demo
 from scanweld.cli.evaluate import evaluate
+from scanweld.cli.examples import examples_of
 from scanweld.cli.mesh import mesh
 from scanweld.cli.register import register
 from scanweld.cli.render import render
 from scanweld.cli.report import report
 from scanweld.cli.slam import slam
+from scanweld.cli.usage import help_of, in_plain_words
+from scanweld.cli.view import view
 from scanweld.cli.warmup import warmup
 from scanweld.errors import ScanweldError
 
@@ -55,8 +59,22 @@ def _stoppable(command: Callable[..., int]) -> Callable[..., int]:
     return call
 
 
-for command in (demo, slam, register, evaluate, render, report, mesh, config, datasets, bench, warmup):
-    app.command()(_stoppable(command))
+for command in (
+    demo,
+    slam,
+    register,
+    evaluate,
+    render,
+    report,
+    view,
+    mesh,
+    config,
+    datasets,
+    bench,
+    warmup,
+    completion,
+):
+    app.command(help=help_of(command), epilog=examples_of(command.__name__))(_stoppable(command))
 
 
 @app.callback(invoke_without_command=True)
@@ -93,18 +111,28 @@ def run(arguments: Sequence[str]) -> int:
     except (KeyboardInterrupt, typer.Abort):
         print("interrupted; nothing was written", file=sys.stderr)
         return 130
-    except BrokenPipeError:  # the reader of a pipe has gone: no more to say, and no traceback at exit
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except BrokenPipeError:
+        _drop_output()
+        return 0
+    except SystemExit as end:  # by this the parser tells of a closed pipe, and ends what it does by itself
+        if end.code != 1:
+            raise
+        _drop_output()
         return 0
     except OSError as error:  # what the library does not expect: standard output on a full disk, too many open files
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _drop_output()
         print(f"error: {error}", file=sys.stderr)
         return 1
     except Exception as error:
         # Usage errors of the parser carry their exit code and know how to show themselves.
-        show = getattr(error, "show", None)
+        show = getattr(in_plain_words(error), "show", None)
         if show is None:
             raise
         show()
         return int(getattr(error, "exit_code", 2))
     return int(code or 0)
+
+
+def _drop_output() -> None:
+    """Let the rest of standard output vanish: nobody takes it, and no traceback is wanted at exit."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -1,0 +1,33 @@
+"""Help and usage errors in the words of a person who types commands."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from typing import Any
+
+WORDS = {
+    "int_parsing": "expected a whole number",
+    "float_parsing": "expected a number",
+    "greater_than_equal": "expected {ge:g} or more",
+}
+"""What the kinds of errors of Pydantic mean, by which Typer checks values."""
+
+
+def help_of(command: Callable[..., Any]) -> str:
+    """Return the docstring of a command, a line for each paragraph: a terminal breaks lines where it ends."""
+    paragraphs = inspect.cleandoc(command.__doc__ or "").split("\n\n")
+    return "\n\n".join(" ".join(paragraph.split()) for paragraph in paragraphs)
+
+
+def in_plain_words(error: Exception) -> Exception:
+    """Return a usage error of the parser with a message that tells what was expected and what was got."""
+    faults = getattr(error.__cause__, "errors", None)
+    if faults is not None and hasattr(error, "message"):
+        fault = faults()[0]
+        words = WORDS.get(fault["type"])
+        if words is not None:
+            error.message = f"{words.format(**fault.get('ctx', {}))}, got {str(fault['input'])!r}"
+        else:
+            error.message = fault["msg"].removeprefix("Value error, ")
+    return error
