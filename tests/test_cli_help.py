@@ -7,10 +7,13 @@ import re
 import subprocess
 import sys
 from importlib.metadata import version
+from typing import Any
 
 import pytest
+import typer
 
 from scanweld.cli.app import app
+from scanweld.cli.usage import in_plain_words
 
 OPTIONS = {
     "demo": "--out --frames --threads --json",
@@ -20,11 +23,13 @@ OPTIONS = {
     "evaluate": "--align --json --plot",
     "render": "--out --scene --path --path-frame --noise --frames --size --fps --seed --force",
     "report": "--truth --out",
+    "view": "--host --port",
     "mesh": "--out --voxel --frames --depth-max --fill-holes --from-surfels --splat --memory --threads --json",
     "bench": "--frames --sizes --peer-python --plot --threads --json",
     "warmup": "--json",
     "config": "--set",
     "datasets": "--format",
+    "completion": "",
 }
 """What every command must offer."""
 
@@ -100,19 +105,66 @@ def test_wrong_usage_exits_2(arguments: list[str]) -> None:
     assert "Traceback" not in done.stderr
 
 
-@pytest.mark.parametrize("columns", [40, 100])
-def test_no_color_is_respected(columns: int) -> None:
-    done = scanweld("slam", "--help", columns=columns, NO_COLOR="1")
-    assert done.returncode == 0
-    assert "\x1b" not in done.stdout
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (["demo", "--frames", "many"], ["--frames", "many"]),
+        (["slam", "room", "--scale", "half"], ["--scale", "half"]),
+        (["demo", "--frames", "1"], ["--frames", "2"]),
+        (["bench", "speed"], ["speed", "sizes", "stages"]),
+    ],
+)
+def test_a_wrong_value_is_named(arguments: list[str], named: list[str]) -> None:
+    told = scanweld(*arguments).stderr
+    assert [word for word in named if word not in told] == []
+    assert "Input should be" not in told
+    assert "Value error" not in told
 
 
-@pytest.mark.skipif(os.name == "nt", reason="needs a POSIX shell")
-@pytest.mark.parametrize("command", ["", "slam", "register"])
-def test_a_closed_pipe_is_no_error(command: str) -> None:
-    done = subprocess.run(
-        ["/bin/sh", "-c", f"'{sys.executable}' -m scanweld {command} --help | head -1"],
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    assert done.returncode == 0
-    assert done.stderr == ""
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        ({"type": "int_parsing", "input": "many", "msg": "?"}, "expected a whole number, got 'many'"),
+        ({"type": "float_parsing", "input": "half", "msg": "?"}, "expected a number, got 'half'"),
+        ({"type": "greater_than_equal", "input": -1.5, "ctx": {"ge": 2}, "msg": "?"}, "expected 2 or more, got '-1.5'"),
+        ({"type": "value_error", "input": "x", "msg": "Value error, 'x' is not one of 'a', 'b'"}, "'x' is not one of"),
+    ],
+)
+def test_plain_words(fault: dict[str, object], words: str) -> None:
+    class Invalid(Exception):
+        """Looks as Pydantic's error does."""
+
+        def errors(self) -> list[dict[str, object]]:
+            return [fault]
+
+    error = typer.BadParameter("?")
+    error.__cause__ = Invalid()
+    assert in_plain_words(error).message.startswith(words)
+    assert in_plain_words(typer.BadParameter("as it is")).message == "as it is"
+
+
+def test_paragraphs_are_broken_by_the_terminal_alone() -> None:
+    for info in app.registered_commands:
+        assert [part for part in info.help.split("\n\n") if "\n" in part or not part] == []
+        assert info.help.split() == info.callback.__doc__.split()
+
+
+@pytest.mark.parametrize("environment", [{"columns": 40, "NO_COLOR": "1"}, {"columns": 100, "TERM": "xterm-256color"}])
+def test_a_pipe_gets_no_escape_codes(environment: dict[str, Any]) -> None:
+    for arguments in (["slam", "--help"], ["slam", "--no-such-option"]):
+        done = scanweld(*arguments, **environment)
+        assert "\x1b" not in done.stdout + done.stderr
+
+
+@pytest.mark.parametrize("arguments", ["--help", "slam --help", "datasets list"])
+def test_a_closed_pipe_is_no_error(arguments: str) -> None:
+    reader, writer = os.pipe()
+    os.close(reader)
+    try:
+        done = subprocess.run(
+            [sys.executable, "-m", "scanweld", *arguments.split()],
+            stdout=writer, stderr=subprocess.PIPE, stdin=subprocess.DEVNULL, text=True, check=False,
+        )  # fmt: skip
+    finally:
+        os.close(writer)
+    assert (done.returncode, done.stderr) == (0, "")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import json
 import logging
+import re
 import shutil
 import subprocess
 import sys
@@ -383,6 +384,10 @@ class TestBadInput:
         self.told(scanweld("slam", room, "--out", "deep/er/run"), "No space left")
 
 
+def result_of(index: int, state: sw.FrameState) -> sw.FrameResult:
+    return sw.FrameResult(index=index, timestamp_s=0, state=state, T_world_camera=np.eye(4), num_surfels=1_234_567)
+
+
 class TestProgress:
     def test_quiet_lines_without_a_terminal(
         self, scanweld: Callable[..., Answer], room: Path, monkeypatch: pytest.MonkeyPatch
@@ -397,13 +402,43 @@ class TestProgress:
         assert "\r" not in err
         assert "\x1b" not in err
 
+    @pytest.mark.parametrize("columns", [40, 100])
+    def test_a_line_on_a_terminal(
+        self, columns: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        """One line at any width, since one that wraps is not overwritten; the second pass says that it is one."""
+        for name, value in {"FORCE_COLOR": "1", "COLUMNS": str(columns), "TERM": "xterm"}.items():
+            monkeypatch.setenv(name, value)
+        with progress.FrameProgress(1500, "slam", then="calibrating") as shown:
+            for index in (*range(1500), *range(1300)):
+                shown.update(result_of(index, sw.FrameState.RELOCALISED))
+            shown._bar.refresh()
+        err = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", capsys.readouterr().err)
+        lines = [line.rstrip() for line in re.split(r"[\r\n]+", err)]
+        assert max(map(len, lines)) <= columns
+        assert lines.count("calibrating") == 1
+        assert any(line.startswith("slam ag") for line in lines)
+        assert not any(line and not line.startswith(("slam", "calibrating")) for line in lines)
+
+    def test_count_of_passes_without_a_terminal(
+        self, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        monkeypatch.setattr(progress, "QUIET_INTERVAL_S", 0.0)
+        with progress.FrameProgress(2, "slam", then="calibrating") as shown:
+            for index in (0, 1, 0, 1):
+                shown.update(result_of(index, sw.FrameState.TRACKING))
+        heads = [" ".join(line.split()[:4]) for line in capsys.readouterr().err.splitlines()]
+        assert [head.partition("/2")[0] for head in heads] == [
+            "slam: frame 1", "slam: frame 2", "calibrating", "slam again: frame 1", "slam again: frame 2",
+        ]  # fmt: skip
+
     def test_log_handlers_are_put_back(self, monkeypatch: pytest.MonkeyPatch) -> None:
         before = logging.getLogger().handlers[:]
         for terminal in ("1", ""):
             monkeypatch.setenv("FORCE_COLOR", terminal)
             with progress.FrameProgress(2, "x") as shown:
                 shown.say("compiling")
-                shown.update(sw.FrameResult(index=0, timestamp_s=0, state=sw.FrameState.LOST, T_world_camera=np.eye(4)))
+                shown.update(result_of(0, sw.FrameState.LOST))
             assert logging.getLogger().handlers == before
 
 

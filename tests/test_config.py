@@ -42,6 +42,33 @@ class Config:
         check_ranges(self)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Twice:
+    a: Tracking = section(Tracking, "one")
+    b: Tracking = section(Tracking, "another")
+
+
+@pytest.mark.parametrize(
+    ("values", "advice"),
+    [
+        ({"stable_fraction": 1}, "did you mean 'tracking.stable_fraction'?"),  # of another section
+        ({"tracking": {"max_depth": 1}}, "did you mean 'max_depth_m'?"),
+        ({"tracking": {"stable": 1}}, "did you mean 'tracking.stable_fraction'?"),
+        ({"trackin": {"stable": 1}}, "did you mean 'tracking'?"),
+        ({"tracking": {"zzz": 1}}, "known keys: max_iterations, stable_fraction"),
+    ],
+)
+def test_a_key_is_looked_for_in_all_sections(values: dict[str, object], advice: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        from_mapping(Config, values)
+    assert str(caught.value).endswith(advice)
+
+
+def test_several_keys_of_one_name_are_all_named() -> None:
+    with pytest.raises(ConfigError, match=r"did you mean 'a\.max_iterations' or 'b\.max_iterations'\?"):
+        from_mapping(Twice, {"max_iterations": 3})
+
+
 def test_absent_keys_keep_their_defaults() -> None:
     assert from_mapping(Config, {}) == Config()
     assert from_mapping(Config, {"tracking": {"max_iterations": 3}}) == Config(tracking=Tracking(max_iterations=3))

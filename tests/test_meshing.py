@@ -463,8 +463,17 @@ def test_a_sequence_is_opened_as_it_was_for_the_run(finished_run: Path) -> None:
 
 
 def test_a_folder_that_is_no_run(tmp_path: Path) -> None:
-    with pytest.raises(FileFormatError, match=r"is no run folder \(no run.json\)"):
+    with pytest.raises(FileFormatError, match=r"not a run folder \(no run.json\)"):
         mesh_run(tmp_path)
+
+
+@pytest.mark.parametrize("arguments", [["nowhere"], ["RUN", "--out", "mesh.stl"]])
+def test_faults_are_told_before_anything_is_compiled(
+    finished_run: Path, arguments: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("scanweld.parallel.kernels_are_cached", lambda group, now=False: False)
+    assert run_command(["mesh", *(str(finished_run) if word == "RUN" else word for word in arguments)]) == 1
+    assert capsys.readouterr().err.startswith("error: ")
 
 
 def test_command_line(finished_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -475,7 +484,9 @@ def test_command_line(finished_run: Path, tmp_path: Path, capsys: pytest.Capture
     assert figures["voxel_m"] == 0.05
     assert out.read_bytes().startswith(b"glTF")
     assert run_command(["mesh", str(finished_run), "--splat", "--out", str(tmp_path / "splats.ply")]) == 0
-    assert PlyData.read(str(tmp_path / "splats.ply"))["vertex"].count > 1000
+    count = PlyData.read(str(tmp_path / "splats.ply"))["vertex"].count
+    assert count > 1000
+    assert f"splats   {count:,}\n" in capsys.readouterr().out
     assert run_command(["mesh", str(finished_run), "--out", str(tmp_path / "mesh.stl")]) == 1
     assert "known: PLY, OBJ, GLB" in capsys.readouterr().err
 

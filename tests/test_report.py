@@ -266,7 +266,7 @@ class TestCharts:
 
 class TestFiles:
     def test_what_is_no_run_is_refused_in_one_line(self, tmp_path: Path) -> None:
-        with pytest.raises(FileFormatError, match=r"not a run folder: it has no run\.json"):
+        with pytest.raises(FileFormatError, match=r"not a run folder \(no run\.json\)"):
             write_report(tmp_path)
 
     @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ import csv
 import json
 import logging
 import re
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,6 +17,7 @@ import pytest
 import scanweld as sw
 from rendered import CAMERA, MemorySequence, blind, rendered
 from scanweld.config import load_toml
+from scanweld.io.atomic import write_file
 from scanweld.mapping.rendering import BACKGROUND
 from scanweld.runs import output
 from scanweld.runs.folder import check_writable, next_run_folder, write_folder
@@ -220,6 +222,13 @@ class TestCompleteOrAbsent:
         with pytest.raises(expected, match="No space" if isinstance(error, OSError) else None):
             sw.run_sequence(rendered(count=40).part(0, 2), out=tmp_path / "run")
         assert list(tmp_path.iterdir()) == []
+
+    @pytest.mark.parametrize("write", [lambda path: path.write_bytes(b""), lambda path: write_file(path, b"")])
+    def test_the_folder_aside_is_not_named(self, tmp_path: Path, write: Callable[[Path], object]) -> None:
+        """What cannot be written is told by the name that it would have had in the end."""
+        expected = f"{tmp_path / 'run' / 'absent' / 'map.ply'}: cannot be written: No such file"
+        with pytest.raises(sw.OutputError, match=re.escape(expected)), write_folder(tmp_path / "run", force=False) as f:
+            write(f / "absent" / "map.ply")
 
     def test_old_run_survives_a_failure(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         folder = tmp_path / "run"

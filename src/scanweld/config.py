@@ -7,7 +7,7 @@ import difflib
 import json
 import math
 import tomllib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any, TypeVar, get_type_hints
 
@@ -41,22 +41,33 @@ def check_ranges(config: Any) -> None:
 def from_mapping(kind: type[T], values: Mapping[str, Any], where: str = "configuration", prefix: str = "") -> T:
     """Build the dataclass `kind` from nested mappings; absent keys keep their defaults.
 
+    Parameters
+    ----------
+    kind : of the configuration
+    values : nested by section
+    where : what messages begin with: where the values are from
+    prefix : what messages put before every key, where `kind` is itself a section
+
     Raises
     ------
     ConfigError
         On an unknown key (the message names the nearest one), a wrong type or a value out of range.
     """
+    return _build(kind, values, where, prefix, lambda: list(_all_keys(kind, prefix)))
+
+
+def _build(kind: type[T], values: Mapping[str, Any], where: str, prefix: str, all_keys: Callable[[], list[str]]) -> T:
     hints = get_type_hints(kind)
     known = {f.name: f for f in dataclasses.fields(kind)}  # type: ignore[arg-type]
     arguments: dict[str, Any] = {}
     for key, value in values.items():
         if key not in known:
-            raise ConfigError(f"{where}: unknown key '{prefix}{key}'{_nearest(key, known, prefix)}")
+            raise ConfigError(f"{where}: unknown key '{prefix}{key}'; {_advice(key, known, prefix, all_keys())}")
         hint = hints[key]
         if dataclasses.is_dataclass(hint):
             if not isinstance(value, Mapping):
                 raise ConfigError(f"{where}: '{prefix}{key}' is a section, got the value {value!r}")
-            arguments[key] = from_mapping(hint, value, where, f"{prefix}{key}.")  # type: ignore[arg-type]
+            arguments[key] = _build(hint, value, where, f"{prefix}{key}.", all_keys)  # type: ignore[arg-type]
         else:
             arguments[key] = _checked(value, hint, f"{where}: '{prefix}{key}'")
     try:
@@ -65,10 +76,34 @@ def from_mapping(kind: type[T], values: Mapping[str, Any], where: str = "configu
         raise ConfigError(f"{where}: {prefix}{error}") from None
 
 
-def _nearest(key: str, known: Iterable[str], prefix: str) -> str:
-    close = difflib.get_close_matches(key, list(known), n=1, cutoff=0.4)
-    names = ", ".join(sorted(known))
-    return f"; did you mean '{prefix}{close[0]}'?" if close else f"; known keys: {names}"
+def _all_keys(kind: Any, prefix: str) -> Iterator[str]:
+    """Yield the dotted keys of a configuration and of its sections."""
+    hints = get_type_hints(kind)
+    for item in dataclasses.fields(kind):
+        yield prefix + item.name
+        if dataclasses.is_dataclass(hints[item.name]):
+            yield from _all_keys(hints[item.name], f"{prefix}{item.name}.")
+
+
+SAME_KEY, SAME_KEY_HERE = 0.75, 0.5
+"""A key may be meant that is at least so much like the given one: anywhere, and in the section where that was."""
+
+
+def _advice(key: str, known: Collection[str], prefix: str, all_keys: Collection[str]) -> str:
+    """Say which key may be meant: the nearest of its section, or nearer ones elsewhere; else what there is."""
+
+    def likeness(name: str) -> float:
+        return difflib.SequenceMatcher(None, key, name.rpartition(".")[2]).ratio()
+
+    here = max((prefix + name for name in known), key=likeness)
+    closest = max(map(likeness, all_keys))
+    if likeness(here) < closest and closest >= SAME_KEY:
+        names = [name for name in all_keys if likeness(name) == closest]
+        least_nested = min(name.count(".") for name in names)
+        return f"did you mean {' or '.join(repr(name) for name in names if name.count('.') == least_nested)}?"
+    if likeness(here) >= SAME_KEY_HERE:
+        return f"did you mean '{here}'?"
+    return f"known keys: {', '.join(sorted(known))}"
 
 
 def _checked(value: Any, hint: Any, where: str) -> Any:

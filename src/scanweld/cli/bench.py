@@ -3,30 +3,23 @@
 from __future__ import annotations
 
 import json
-import sys
 import tempfile
-import time
 from collections.abc import Sequence
 from dataclasses import asdict
 from enum import StrEnum
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 if TYPE_CHECKING:
     from scanweld.benchmarking.machine import Machine
     from scanweld.benchmarking.sizes import SpeedResult
     from scanweld.benchmarking.stages import StageCost
+    from scanweld.cli.progress import CountProgress
     from scanweld.datasets.base import RgbdSequence
 
 Option = typer.Option
-
-QUIET_INTERVAL_S = 5.0
-"""Without a terminal, a line is printed this often."""
 
 RENDERED_FRAMES = 60
 
@@ -63,6 +56,8 @@ def bench(
     Over floor is the time of a stage over that of copying as many bytes as it moves at least.
     """
     from scanweld.benchmarking.machine import measure_machine
+    from scanweld.cli.image_size import parse_size
+    from scanweld.cli.progress import CountProgress
     from scanweld.parallel import set_num_threads
     from scanweld.slam.warmup import compile_kernels
 
@@ -70,7 +65,7 @@ def bench(
         raise typer.BadParameter("--plot and --peer-python belong to `bench sizes`")
     if kind is Kind.SIZES and sequence is not None:
         raise typer.BadParameter("a sequence belongs to `bench stages`")
-    chosen = _parse_sizes(sizes)
+    chosen = [] if sizes is None else [parse_size(size) for size in sizes.split(",")]
     if threads is not None:
         set_num_threads(threads)
     with CountProgress() as progress, tempfile.TemporaryDirectory(prefix="scanweld-bench-") as folder:
@@ -169,52 +164,3 @@ def _sizes_text(results: Sequence[SpeedResult]) -> str:
     if not any(r.program == "open3d" for r in results):
         lines.append("Open3D is not installed here: nothing to compare with (--peer-python names another interpreter).")
     return "\n".join(lines)
-
-
-def _parse_sizes(text: str | None) -> list[tuple[int, int]]:
-    from scanweld.cli.render import _parse_size
-
-    return [] if text is None else [_parse_size(part) for part in text.split(",")]
-
-
-class CountProgress:
-    """Shows what is being done and how far it is, on standard error; without a terminal a line now and then."""
-
-    def __init__(self) -> None:
-        console = Console(stderr=True)
-        columns = (
-            TextColumn("{task.description}"),
-            BarColumn(bar_width=None),
-            MofNCompleteColumn(),
-            TimeRemainingColumn(),
-        )
-        self._live = console.is_terminal
-        self._bar = Progress(*columns, console=console, transient=True, disable=not self._live)
-        self._task = self._bar.add_task("", total=None)
-        self._title, self._spoken = "", time.perf_counter()
-
-    def __enter__(self) -> CountProgress:
-        self._bar.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        self._bar.stop()
-
-    def begin(self, title: str) -> None:
-        """Say what begins."""
-        self._title, self._spoken = title, time.perf_counter()
-        if self._live:
-            self._bar.reset(self._task, description=title, total=None)
-        else:
-            print(title, file=sys.stderr, flush=True)
-
-    def update(self, done: int, total: int) -> None:
-        """Show `done` of `total`."""
-        now = time.perf_counter()
-        if self._live:
-            self._bar.update(self._task, completed=done, total=total)
-        elif now - self._spoken > QUIET_INTERVAL_S:
-            self._spoken = now
-            print(f"{self._title}: {done}/{total}", file=sys.stderr, flush=True)

@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from scanweld.cli.completion import formats
 from scanweld.errors import DatasetError
 
 
@@ -21,7 +22,9 @@ class Action(StrEnum):
 def datasets(
     action: Annotated[Action, typer.Argument(help="list: the formats; check: open a sequence and say what it holds.")],
     sequence: Annotated[Path | None, typer.Argument(help="Sequence to check.")] = None,
-    format_name: Annotated[str, typer.Option("--format", help="Format of the sequence to check.")] = "auto",
+    format_name: Annotated[
+        str, typer.Option("--format", help="Format of the sequence to check.", autocompletion=formats)
+    ] = "auto",
 ) -> int:
     """List the formats of sequences, or look into one: camera, frames, times, truth, and how much depth there is."""
     from scanweld.datasets.open import FORMATS, open_sequence

@@ -24,7 +24,7 @@ def demo(
 ) -> int:
     """Render a furnished room with the noise of a Kinect, run SLAM on it, evaluate, and draw the map."""
     started = time.perf_counter()
-    from scanweld.cli.progress import RenderProgress
+    from scanweld.cli.progress import CountProgress
     from scanweld.cli.slam import print_summary, run_with_progress
     from scanweld.datasets.open import open_sequence
     from scanweld.datasets.synthetic import RenderConfig, render_sequence
@@ -36,7 +36,7 @@ def demo(
     config = RenderConfig(scene="room", noise="kinect", frames=frames)
     # Rendered to files first: the speed that is reported is that of reading and mapping a recording.
     with tempfile.TemporaryDirectory(prefix="scanweld-demo-") as folder:
-        with RenderProgress() as progress:
+        with CountProgress("rendering frames") as progress:
             render_sequence(Path(folder) / "room", config, progress=progress.update)
         summary = run_with_progress(
             open_sequence(Path(folder) / "room"), SlamConfig(), out, threads=threads, force=force,

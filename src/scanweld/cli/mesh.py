@@ -19,8 +19,9 @@ def mesh(
         Path | None, Option(help="File to write: .ply, .obj or .glb. Default: RUN/mesh.ply.", metavar="FILE")
     ] = None,
     voxel: Annotated[
-        float, Option(help="Spacing of the grid in metres. Default: by pixels and noise at the usual depth.", min=0.0)
-    ] = 0.0,
+        float | None,
+        Option(help="Spacing of the grid in metres. Default: by pixels and noise at the usual depth.", min=0.0),
+    ] = None,
     frames: Annotated[
         str | None, Option(help="Fuse these frames. Default: all that show something new.", metavar="A:B[:STEP]")
     ] = None,
@@ -30,7 +31,7 @@ def mesh(
         bool, Option("--from-surfels", help="Mesh the surfels of map.ply, without the sequence.")
     ] = False,
     splat: Annotated[bool, Option("--splat", help="Write Gaussian splats instead. Default: RUN/splats.ply.")] = False,
-    memory: Annotated[float | None, Option(help="Memory that the grid may take in MB; default 2000.", min=1.0)] = None,
+    memory: Annotated[float | None, Option(help="Memory that the grid may take in MB. Default: 2000.", min=1.0)] = None,
     threads: Annotated[int | None, Option(help="Number of threads. Default: all cores.", min=1)] = None,
     json_output: Annotated[bool, Option("--json", help="Print the figures as one JSON object.")] = False,
 ) -> int:
@@ -43,22 +44,30 @@ def mesh(
 
     if splat:
         path, count = write_splats(run, out=out)
-        typer.echo(json.dumps({"path": str(path), "splats": count}) if json_output else f"written  {path}")
+        if json_output:
+            typer.echo(json.dumps({"path": str(path), "splats": count}))
+        else:
+            typer.echo(f"splats   {count:,}\nwritten  {path}")
         return 0
-    from scanweld.cli.progress import RenderProgress
+    from scanweld.cli.progress import CountProgress
+    from scanweld.io.mesh_files import writer_for
     from scanweld.meshing.config import MeshConfig
     from scanweld.parallel import kernels_are_cached, set_num_threads
+    from scanweld.runs.reopen import read_description
 
     if threads is not None:
         set_num_threads(threads)
-    config = MeshConfig(voxel_m=voxel, fill_holes_m=fill_holes)
+    config = MeshConfig(voxel_m=voxel or 0.0, fill_holes_m=fill_holes)
     if depth_max is not None:
         config = replace(config, surfaces=replace(config.surfaces, max_depth_m=depth_max))
     if memory is not None:
         config = replace(config, max_memory_mb=memory)
+    read_description(run)  # what is wrong is told before anything is compiled
+    if out is not None:
+        writer_for(out)
     if not kernels_are_cached("mesh"):
         print("compiling, once for this machine", file=sys.stderr, flush=True)
-    with RenderProgress("mesh") as progress:
+    with CountProgress("fusing frames") as progress:
         made = mesh_run(run, out=out, config=config, frames=frames, from_surfels=from_surfels, progress=progress.update)
     kernels_are_cached("mesh", now=True)
     if json_output:

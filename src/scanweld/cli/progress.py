@@ -9,30 +9,47 @@ from types import TracebackType
 
 from rich.console import Console
 from rich.logging import RichHandler
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, TextColumn, TimeRemainingColumn
+from rich.table import Column
 
 from scanweld.trajectory import FrameResult
 
 QUIET_INTERVAL_S = 5.0
 """Without a terminal, a line is printed this often."""
 
+WIDE_COLUMNS = 80
+"""A narrower terminal has no room for a bar beside the figures."""
+
+
+def _is_wide(console: Console) -> bool:
+    return console.width >= WIDE_COLUMNS
+
+
+def _bar(console: Console, *details: ProgressColumn) -> Progress:
+    """Return a line that says what is done, how much of it, and `details`; it shows nothing without a terminal."""
+    what = TextColumn("{task.description}", markup=False)
+    count = MofNCompleteColumn(table_column=Column(no_wrap=True))
+    columns = [what, count, *details]
+    if _is_wide(console):
+        columns = [what, count, BarColumn(bar_width=None), *details, TimeRemainingColumn()]
+    return Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
+
 
 class FrameProgress:
-    """Shows frames, frames per second, state and surfels of a run."""
+    """Shows frames, frames per second, state and surfels of a run, of which each pass begins with frame 0.
 
-    def __init__(self, total: int, title: str) -> None:
-        self.total, self.title = total, title
+    `then` is said when the frames of the first pass are done, where something follows that takes its time.
+    """
+
+    def __init__(self, total: int | None, title: str, then: str = "") -> None:
+        self.total, self.title, self.then = total, title, then
         self._console = Console(stderr=True)
         self._live = self._console.is_terminal
         self._done = 0
         self._first = self._spoken = time.perf_counter()
 
     def __enter__(self) -> FrameProgress:
-        columns = (
-            TextColumn("[bold]{task.description}"), MofNCompleteColumn(), BarColumn(bar_width=None),
-            TextColumn("{task.fields[detail]}"), TimeRemainingColumn(),
-        )  # fmt: skip
-        self._bar = Progress(*columns, console=self._console, transient=True, disable=not self._live)
+        self._bar = _bar(self._console, TextColumn("{task.fields[detail]}"))
         self._bar.start()
         self._task = self._bar.add_task(self.title, total=self.total, detail="")
         # Log lines and the bar share the terminal: both must go through one console.
@@ -45,23 +62,32 @@ class FrameProgress:
     def say(self, text: str) -> None:
         """Print one line above the bar."""
         if self._live:
-            self._bar.console.print(f"[dim]{text}")
+            self._bar.console.print(text, style="dim", markup=False)
         else:
             print(text, file=sys.stderr, flush=True)
 
     def update(self, result: FrameResult) -> None:
         """Count one frame."""
-        self._done += 1
         now = time.perf_counter()
-        if self._done == 1:
-            self._first = now
+        if result.index == 0:
+            if self._done:
+                self.title += " again"
+                self._bar.reset(self._task, description=self.title)
+            self._done, self._first = 0, now
+        self._done += 1
         fps = (self._done - 1) / (now - self._first) if self._done > 1 else 0.0
-        detail = f"{fps:5.1f} fps  {result.state.name:<10}  {result.num_surfels / 1e3:,.0f}k surfels"
+        detail = f"{fps:5.1f} fps  {result.state.name}"
+        if not self._live or _is_wide(self._console):
+            detail = f"{detail:<22}  {result.num_surfels / 1e3:,.0f}k surfels"
         if self._live:
             self._bar.update(self._task, advance=1, detail=detail)
         elif now - self._spoken > QUIET_INTERVAL_S:
             self._spoken = now
-            print(f"{self.title}: frame {self._done}/{self.total} {detail}", file=sys.stderr, flush=True)
+            of = "" if self.total is None else f"/{self.total}"
+            print(f"{self.title}: frame {self._done}{of} {detail}", file=sys.stderr, flush=True)
+        if self.then and self._done == self.total:
+            self.say(self.then)
+            self.then = ""
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
@@ -70,33 +96,36 @@ class FrameProgress:
         logging.getLogger().handlers[:] = self._handlers
 
 
-class RenderProgress:
-    """Shows how many frames are rendered, or what else `title` says is done with them."""
+class CountProgress:
+    """Shows what is being done, and how much of it is."""
 
-    def __init__(self, title: str = "render") -> None:
-        self.title = title
-
-    def __enter__(self) -> RenderProgress:
+    def __init__(self, title: str = "") -> None:
+        self._title, self._spoken = title, time.perf_counter()
         console = Console(stderr=True)
-        columns = (
-            TextColumn("[bold]{task.description}"), BarColumn(bar_width=None), MofNCompleteColumn(),
-            TimeRemainingColumn(),
-        )  # fmt: skip
         self._live = console.is_terminal
-        self._bar = Progress(*columns, console=console, transient=True, disable=not self._live)
-        self._task = self._bar.add_task(self.title, total=None)
+        self._bar = _bar(console)
+        self._task = self._bar.add_task(title, total=None)
+
+    def __enter__(self) -> CountProgress:
         self._bar.start()
-        self._spoken = time.perf_counter()
         return self
 
     def __exit__(self, *_: object) -> None:
         self._bar.stop()
 
+    def begin(self, title: str) -> None:
+        """Say what begins."""
+        self._title, self._spoken = title, time.perf_counter()
+        if self._live:
+            self._bar.reset(self._task, description=title, total=None)
+        else:
+            print(title, file=sys.stderr, flush=True)
+
     def update(self, done: int, total: int) -> None:
-        """Show `done` of `total` frames."""
+        """Show `done` of `total`."""
         now = time.perf_counter()
         if self._live:
             self._bar.update(self._task, completed=done, total=total)
         elif now - self._spoken > QUIET_INTERVAL_S:
             self._spoken = now
-            print(f"{self.title}: frame {done}/{total}", file=sys.stderr, flush=True)
+            print(f"{self._title}: {done}/{total}", file=sys.stderr, flush=True)

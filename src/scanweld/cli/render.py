@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from scanweld.errors import ConfigError
+from scanweld.cli.completion import noises, scenes
 
 Option = typer.Option
 
 
 def render(
     out: Annotated[Path, Option(help="Folder to write the sequence to (TUM RGB-D layout).", metavar="SEQUENCE")],
-    scene: Annotated[str | None, Option(help="room, corridor (a loop), twin-rooms or wall. Default: room.")] = None,
+    scene: Annotated[
+        str | None, Option(help="room, corridor (a loop), twin-rooms or wall. Default: room.", autocompletion=scenes)
+    ] = None,
     path: Annotated[
         str | None,
         Option(
@@ -28,7 +29,9 @@ def render(
         str | None,
         Option(help="Axes of the file: cv (y down) or icl (ICL-NUIM: y up, fy = -480). Default: cv."),
     ] = None,
-    noise: Annotated[str | None, Option(help="none, kinect or realsense. Default: none.")] = None,
+    noise: Annotated[
+        str | None, Option(help="none, kinect or realsense. Default: none.", autocompletion=noises)
+    ] = None,
     frames: Annotated[
         int | None, Option(help="Number of frames. Default: one round of a built-in path, all of a file.")
     ] = None,
@@ -38,7 +41,8 @@ def render(
     force: Annotated[bool, Option("--force", help="Replace a sequence that exists.")] = False,
 ) -> int:
     """Render a furnished room or a loop of corridors as an RGB-D sequence with exact ground truth."""
-    from scanweld.cli.progress import RenderProgress
+    from scanweld.cli.image_size import parse_size
+    from scanweld.cli.progress import CountProgress
     from scanweld.datasets.synthetic import RenderConfig, render_sequence
 
     given: dict[str, Any] = {
@@ -46,9 +50,9 @@ def render(
         "seed": seed,
     }  # fmt: skip
     if size is not None:
-        given["width"], given["height"] = _parse_size(size)
+        given["width"], given["height"] = parse_size(size)
     config = RenderConfig(**{key: value for key, value in given.items() if value is not None})
-    with RenderProgress() as progress:
+    with CountProgress("rendering frames") as progress:
         sequence = render_sequence(out, config, force=force, progress=progress.update)
     camera, truth = sequence.camera, sequence.ground_truth
     typer.echo(
@@ -56,10 +60,3 @@ def render(
         f"{truth.path_length_m:.2f} m of path"
     )
     return 0
-
-
-def _parse_size(text: str) -> tuple[int, int]:
-    match = re.fullmatch(r"(\d+)[xX](\d+)", text.strip())
-    if match is None:
-        raise ConfigError(f"--size {text}: expected WIDTHxHEIGHT, for example 640x480")
-    return int(match[1]), int(match[2])

@@ -13,6 +13,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from scanweld.cli.completion import formats, slam_settings
+from scanweld.cli.view import HOST, PORT, opened_observers
+
 if TYPE_CHECKING:
     from scanweld.datasets.base import RgbdSequence
     from scanweld.runs.run import RunSummary
@@ -26,7 +29,8 @@ def slam(
     sequence: Annotated[
         Path,
         typer.Argument(
-            help="Sequence: a folder or a recording (TUM, ScanNet, Record3D, a ROS bag, ...: see docs/formats.md)."
+            help="Sequence: a folder or a recording (TUM, ScanNet, Record3D, a ROS bag, ...: see docs/formats.md), "
+            "or realsense: for a camera."
         ),
     ],
     out: Annotated[Path | None, Option(help="Run folder. Default: runs/SEQUENCE-N.", metavar="RUN")] = None,
@@ -34,8 +38,9 @@ def slam(
         str,
         Option(
             "--format",
-            help="auto, 7scenes, bonn, bundlefusion, eth3d, icl, record3d, redwood, replica, rosbag, scannet, stray, "
-            "tum, video.",
+            help="auto, 7scenes, bonn, bundlefusion, eth3d, icl, realsense, record3d, redwood, replica, rosbag, "
+            "scannet, stray, tum, video.",
+            autocompletion=formats,
         ),
     ] = "auto",
     topics: Annotated[
@@ -48,7 +53,8 @@ def slam(
     poses: Annotated[str | None, Option(help="Fuse at given poses instead of tracking.", metavar="truth|FILE")] = None,
     config: Annotated[Path | None, Option(help="Configuration file.", metavar="F.toml")] = None,
     overrides: Annotated[
-        list[str] | None, Option("--set", help="Set one value, for example tracking.stable_fraction=0.1.")
+        list[str] | None,
+        Option("--set", help="Set one value, for example tracking.stable_fraction=0.1.", autocompletion=slam_settings),
     ] = None,
     threads: Annotated[int | None, Option(help="Number of threads. Default: all cores.", min=1)] = None,
     tracked_only: Annotated[
@@ -58,6 +64,14 @@ def slam(
         bool, Option("--calibrate", help="Estimate intrinsics and depth offset, then run again with them.")
     ] = False,
     refine: Annotated[bool, Option("--refine", help="Adjust all keyframes together in the end.")] = False,
+    view: Annotated[bool, Option("--view", help="Show the run in the browser while it goes by.")] = False,
+    view_host: Annotated[
+        str, Option(help="Where --view listens; others than this machine need the token of its address.")
+    ] = HOST,
+    view_port: Annotated[int, Option(help="Port of --view.", min=0, max=65535)] = PORT,
+    rerun: Annotated[
+        str | None, Option(help="Record the run for Rerun, or show it there.", metavar="F.rrd|live|URL")
+    ] = None,
     force: Annotated[bool, Option("--force", help="Replace an existing run.")] = False,
     json_output: Annotated[bool, Option("--json", help="Print the metrics as one JSON object.")] = False,
 ) -> int:
@@ -66,6 +80,7 @@ def slam(
     Exit code 3 says that the run ended LOST or tracked fewer than half of the frames; its folder is complete.
     """
     started = time.perf_counter()
+    from scanweld.datasets.base import LiveSequence
     from scanweld.datasets.intrinsics import parse_intrinsics
     from scanweld.datasets.open import open_sequence
 
@@ -84,16 +99,21 @@ def slam(
 
     folder = out or next_run_folder(opened.name)
     given = None if poses is None else given_poses(opened, poses)
+    place = str(sequence if isinstance(opened, LiveSequence) else sequence.resolve())
     description = {
-        "input": str(sequence.resolve()), "format": format_name, "frames": frames, "scale": scale, "poses": poses,
+        "input": place, "format": format_name, "frames": frames, "scale": scale, "poses": poses,
         "camera": camera, "depth_scale": depth_scale, "topics": topics, "config": str(config) if config else None,
         "set": overrides or [], "calibrate": calibrate, "refine": refine, "warnings": warnings,
     }  # fmt: skip
-    summary = run_with_progress(
-        opened, settings, folder, force=force, poses=given, threads=threads, tracked_only=tracked_only,
-        calibrate=calibrate, refine=refine, description=description, started=started,
-    )  # fmt: skip
-    return print_summary(summary, json_output=json_output)
+    with opened_observers(opened.name, view=view, host=view_host, port=view_port, rerun=rerun) as observers:
+        summary = run_with_progress(
+            opened, settings, folder, force=force, poses=given, threads=threads, tracked_only=tracked_only,
+            calibrate=calibrate, refine=refine, observers=observers.all, description=description, started=started,
+        )  # fmt: skip
+        code = print_summary(summary, json_output=json_output)
+        if not summary.interrupted:
+            observers.stay()
+    return code
 
 
 @contextlib.contextmanager
@@ -155,8 +175,10 @@ def run_with_progress(
     if threads is not None:
         set_num_threads(threads)
     check_writable(folder, force=options.get("force", False))
-    passes = 2 if options.get("calibrate") else 1
-    with FrameProgress(passes * len(sequence), title) as progress:
+    then = "adjusting all keyframes together" if options.get("refine") else ""
+    if options.get("calibrate"):
+        then = "calibrating the camera; where that helps, all frames are tracked again"
+    with FrameProgress(len(sequence) or None, title, then) as progress:
         compile_kernels(lambda part: progress.say(f"compiling, once for this machine: {part}"))
         return run_sequence(sequence, config, out=folder, progress=progress.update, started=started, **options)
 

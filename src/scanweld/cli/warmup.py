@@ -18,7 +18,7 @@ def warmup(
     They are kept in the cache folder that is printed; NUMBA_CACHE_DIR names another one.
     """
     started = time.perf_counter()
-    from scanweld.cli.bench import CountProgress
+    from scanweld.cli.progress import CountProgress
     from scanweld.slam.warmup import compile_kernels
 
     with CountProgress() as progress:

@@ -78,7 +78,7 @@ def plot_trajectory_error(result: AteResult, path: Path, *, title: str = "") -> 
     try:
         figure.savefig(path, dpi=150)
     except (OSError, ValueError) as error:
-        raise OutputError(f"{path}: the plot cannot be written: {error}") from None
+        raise OutputError(f"{path}: the plot cannot be written: {getattr(error, 'strerror', None) or error}") from None
 
 
 def _ground_axes(positions_m: Float64) -> tuple[int, int]:

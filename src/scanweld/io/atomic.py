@@ -6,14 +6,14 @@ import contextlib
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from scanweld.errors import OutputError
 
 
-def write_file(path: Path, content: bytes) -> None:
-    """Write a file, or replace one.
+def write_file(path: Path, content: bytes | Iterable[bytes]) -> None:
+    """Write a file, or replace one; `content` may come in parts, which are written as they come.
 
     Raises
     ------
@@ -24,13 +24,14 @@ def write_file(path: Path, content: bytes) -> None:
     try:
         with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", delete=False) as file:
             temporary = Path(file.name)
-            file.write(content)
+            file.writelines([content] if isinstance(content, bytes) else content)
         temporary.chmod(0o666 & ~_umask())  # temporary files are private, results are not
         temporary.replace(path)
     except OSError as error:
-        if temporary is not None:
-            temporary.unlink(missing_ok=True)
         raise OutputError(f"{path}: cannot be written: {error.strerror or error}") from None
+    finally:
+        if temporary is not None:
+            temporary.unlink(missing_ok=True)  # it is there no longer, or half written
 
 
 def check_writable(folder: Path, *, force: bool, kind: str, mark: str) -> None:
@@ -51,9 +52,9 @@ def check_writable(folder: Path, *, force: bool, kind: str, mark: str) -> None:
         if not force:
             raise OutputError(f"{folder}: exists and is not empty; --force replaces it, --out writes elsewhere")
         if not (folder / mark).is_file():
-            raise OutputError(f"{folder}: is not a {kind} (no {mark}), so --force will not replace it")
-    with _parents(folder, keep=False), tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent):
-        pass
+            raise OutputError(f"{folder}: not a {kind} (no {mark}), so --force will not replace it")
+    with _parents(folder, keep=False):
+        _folder_beside(folder).rmdir()
 
 
 @contextlib.contextmanager
@@ -70,13 +71,27 @@ def write_folder(folder: Path, *, force: bool, kind: str, mark: str) -> Iterator
     check_writable(folder, force=force, kind=kind, mark=mark)
     folder = folder.resolve()  # a link keeps pointing at the result
     with _parents(folder, keep=True):
-        aside = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+        aside = _folder_beside(folder)
         try:
             yield aside
             aside.chmod(0o777 & ~_umask())
             _put_in_place(aside, folder)
+        except OutputError as error:  # the one that asked knows nothing of the folder aside
+            raise OutputError(str(error).replace(str(aside), str(folder))) from None
+        except OSError as error:
+            error.filename = error.filename and str(error.filename).replace(str(aside), str(folder))
+            raise
         finally:
             shutil.rmtree(aside, ignore_errors=True)
+
+
+def _folder_beside(folder: Path) -> Path:
+    """Make a hidden folder in the place where `folder` shall be; what keeps it from being made keeps `folder`, too."""
+    try:
+        return Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+    except OSError as error:
+        error.filename = str(folder)
+        raise
 
 
 def _umask() -> int:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Container, Mapping
+from collections.abc import Container, Iterator, Mapping
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -24,6 +24,17 @@ class HasColumns(Protocol):
 
     def columns(self) -> dict[str, Array]:
         """Return equally long 1-D arrays by property name, in file order."""
+
+
+@runtime_checkable
+class HasBatches(HasColumns, Protocol):
+    """What can be written part by part, because it may be larger than memory: a SurfelMap."""
+
+    def __len__(self) -> int:
+        """Return the number of rows in all."""
+
+    def batches(self) -> Iterator[dict[str, Array]]:
+        """Yield `columns()` in parts, in order."""
 
 
 def cloud_from_columns(path: Path, columns: Mapping[str, Array]) -> PointCloud:
@@ -51,8 +62,10 @@ def cloud_from_columns(path: Path, columns: Mapping[str, Array]) -> PointCloud:
     return drop_not_finite(path, PointCloud(points, normals, _colors(named)))
 
 
-def columns_to_write(path: Path, thing: HasColumns, kinds: Container[str], file_kind: str) -> dict[str, Array]:
-    """Return the columns of `thing`, of one length and of types that the file can hold.
+def columns_to_write(
+    path: Path, columns: Mapping[str, Array], kinds: Container[str], file_kind: str
+) -> dict[str, Array]:
+    """Return columns as arrays of one length and of types that the file can hold.
 
     Parameters
     ----------
@@ -64,7 +77,7 @@ def columns_to_write(path: Path, thing: HasColumns, kinds: Container[str], file_
     OutputError
         When the lengths differ, or a type has no place in the file.
     """
-    columns = {name: np.asarray(values) for name, values in thing.columns().items()}
+    columns = {name: np.asarray(values) for name, values in columns.items()}
     lengths = {name: values.shape for name, values in columns.items()}
     if len(set(lengths.values())) != 1 or any(values.ndim != 1 for values in columns.values()):
         raise OutputError(f"{path}: a {file_kind} file needs columns of one length, got {lengths}")

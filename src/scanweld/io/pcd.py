@@ -114,7 +114,7 @@ def write_pcd(path: str | os.PathLike[str], thing: HasColumns, *, encoding: Enco
     """
     if encoding not in _READERS:
         raise InvalidInputError(f"encoding: expected one of {', '.join(_READERS)}, got {encoding!r}")
-    columns = _packed(columns_to_write(Path(path), thing, _KINDS.values(), "PCD"), encoding)
+    columns = _packed(columns_to_write(Path(path), thing.columns(), _KINDS.values(), "PCD"), encoding)
     count = len(next(iter(columns.values())))
     kinds = [values.dtype.str[1:] for values in columns.values()]
     lines = [

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import struct
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from scanweld.arrays import Array
 from scanweld.errors import FileFormatError
 from scanweld.geometry.point_cloud import PointCloud
 from scanweld.io.atomic import write_file
-from scanweld.io.columns import HasColumns, cloud_from_columns, columns_to_write
+from scanweld.io.columns import HasBatches, HasColumns, cloud_from_columns, columns_to_write
 from scanweld.io.tables import number_table
 
 _HEADER_LIMIT = 1 << 16
@@ -63,21 +64,35 @@ class _Header:
 def write_ply(path: str | os.PathLike[str], thing: HasColumns) -> None:
     """Write the columns of `thing` as a binary little-endian PLY file, complete or not at all.
 
-    Columns keep their type (float32, float64 and integers up to 32 bits).
+    Columns keep their type (float32, float64 and integers up to 32 bits). Of what has `batches` of columns, as a
+    SurfelMap does, one is in memory at a time.
 
     Raises
     ------
     OutputError
         When the file cannot be written, or a column's type has no place in a PLY file.
     """
-    columns = columns_to_write(Path(path), thing, _NAMES, "PLY")
-    fields = [(name, "<" + values.dtype.str[1:]) for name, values in columns.items()]
-    table = np.empty(len(next(iter(columns.values()))), dtype=fields)
-    for name, values in columns.items():
-        table[name] = values
-    lines = ["ply", "format binary_little_endian 1.0", "comment scanweld, metres", f"element vertex {len(table)}"]
-    lines += [f"property {_NAMES[kind[1:]]} {name}" for name, kind in fields]
-    write_file(Path(path), "\n".join([*lines, "end_header", ""]).encode("ascii") + table.tobytes())
+    if isinstance(thing, HasBatches) and len(thing):
+        parts = (columns_to_write(Path(path), columns, _NAMES, "PLY") for columns in thing.batches())
+        write_file(Path(path), _binary(parts, len(thing)))
+    else:
+        columns = columns_to_write(Path(path), thing.columns(), _NAMES, "PLY")
+        write_file(Path(path), _binary([columns], len(next(iter(columns.values())))))
+
+
+def _binary(parts: Iterable[dict[str, Array]], count: int) -> Iterator[bytes]:
+    """Yield the bytes of a file of so many vertices, whose columns come in parts of the same names and types."""
+    fields: list[tuple[str, str]] = []
+    for columns in parts:
+        if not fields:
+            fields = [(name, "<" + values.dtype.str[1:]) for name, values in columns.items()]
+            lines = ["ply", "format binary_little_endian 1.0", "comment scanweld, metres", f"element vertex {count}"]
+            lines += [f"property {_NAMES[kind[1:]]} {name}" for name, kind in fields]
+            yield "\n".join([*lines, "end_header", ""]).encode("ascii")
+        table = np.empty(len(next(iter(columns.values()))), dtype=fields)
+        for name, values in columns.items():
+            table[name] = values
+        yield table.tobytes()
 
 
 def read_ply(path: str | os.PathLike[str]) -> PointCloud:

@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from scanweld.geometry.voxels.kernels import first_slot
+from scanweld.geometry.voxels.kernels import slot_of
 from scanweld.parallel import inlined, kernel
 
 SIDE = 8
@@ -36,13 +36,19 @@ def key_of(a, b, c):
 @inlined
 def label_of(key, keys, table):
     """Label of a block, -1 where there is none."""
-    mask = len(table) - 1
-    slot = first_slot(key, mask)
-    label = table[slot]
-    while label >= 0 and keys[label] != key:
-        slot = (slot + 1) & mask
-        label = table[slot]
-    return label
+    return table[slot_of(key, keys, table)]
+
+
+@inlined
+def enter_block(key, keys, table, count):
+    """Enter a block that may be there already; returns the number of blocks then, -1 - count when there is no room."""
+    slot = slot_of(key, keys, table)
+    if table[slot] >= 0:
+        return count
+    if count >= min(len(table) // 2, len(keys)):
+        return -1 - count
+    table[slot], keys[count] = np.int32(count), key
+    return count + 1
 
 
 @inlined
@@ -59,8 +65,6 @@ def mark_blocks(surface, pose, intrinsics, band, block_m, stride, table, keys, c
     taken every `stride` rows and columns. Returns the number of blocks; -1 - number when there is no room for more,
     and -1 - len(keys) - 1 when a block is too far away to be numbered.
     """
-    mask = len(table) - 1
-    largest = min(len(table) // 2, len(keys))
     height, width = surface.shape[0], surface.shape[1]
     last_key = np.int64(-1)
     at = np.empty(3)
@@ -95,16 +99,9 @@ def mark_blocks(surface, pose, intrinsics, band, block_m, stride, table, keys, c
                 key = key_of(cell[0], cell[1], cell[2])
                 if key != last_key:
                     last_key = key
-                    slot = first_slot(key, mask)
-                    label = table[slot]
-                    while label >= 0 and keys[label] != key:
-                        slot = (slot + 1) & mask
-                        label = table[slot]
-                    if label < 0:
-                        if count >= largest:
-                            return -1 - count
-                        table[slot], keys[count] = np.int32(count), key
-                        count += 1
+                    count = enter_block(key, keys, table, count)
+                    if count < 0:
+                        return count
                 axis = 0
                 if until[1] < until[axis]:
                     axis = 1
@@ -253,8 +250,6 @@ def integrate_blocks(start, stop, labels, keys, voxel, pose, intrinsics, pixels,
 @kernel
 def mark_balls(positions, reach, block_m, table, keys, count):
     """Enter the blocks that boxes of half width reach (N,) about positions (N, 3) touch; returns as `mark_blocks`."""
-    mask = len(table) - 1
-    largest = min(len(table) // 2, len(keys))
     low, high = np.empty(3, np.int64), np.empty(3, np.int64)
     for n in range(len(positions)):
         for axis in range(3):
@@ -265,17 +260,9 @@ def mark_balls(positions, reach, block_m, table, keys, count):
         for a in range(low[0], high[0] + 1):
             for b in range(low[1], high[1] + 1):
                 for c in range(low[2], high[2] + 1):
-                    key = key_of(a, b, c)
-                    slot = first_slot(key, mask)
-                    label = table[slot]
-                    while label >= 0 and keys[label] != key:
-                        slot = (slot + 1) & mask
-                        label = table[slot]
-                    if label < 0:
-                        if count >= largest:
-                            return -1 - count
-                        table[slot], keys[count] = np.int32(count), key
-                        count += 1
+                    count = enter_block(key_of(a, b, c), keys, table, count)
+                    if count < 0:
+                        return count
     return count
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -114,6 +114,13 @@ class RunFiles:
     loops: Int64
 
 
+def check_run_folder(folder: Path, needed: Sequence[str]) -> None:
+    """Raise FileFormatError when a folder has not all of the files that a run has."""
+    missing = [name for name in needed if not (folder / name).is_file()]
+    if missing:
+        raise FileFormatError(f"{folder}: not a run folder (no {missing[0]}); `scanweld slam SEQUENCE` makes one")
+
+
 def read_run_files(folder: Path, *, truth: Path | None = None) -> RunFiles:
     """Read a run folder.
 
@@ -127,9 +134,7 @@ def read_run_files(folder: Path, *, truth: Path | None = None) -> RunFiles:
     FileFormatError
         When the folder is no run folder, or one of its files cannot be read.
     """
-    missing = [name for name in NEEDED if not (folder / name).is_file()]
-    if missing:
-        raise FileFormatError(f"{folder}: not a run folder: it has no {missing[0]}; give a folder that slam wrote")
+    check_run_folder(folder, NEEDED)
     run = _read_json(folder / "run.json")
     frames = read_frames(folder / "frames.csv")
     if len(frames) == 0:

@@ -43,6 +43,8 @@ RENDER_WIDTH = 800
 PICTURE_CONFIDENCE = 2.0
 """Surfels below this are left out of pictures."""
 
+_SAMPLED = 20_000  # surfels that say where and how sure the map is
+
 STAGES = ("surfaces", "view", "track", "fuse", "loop")
 
 
@@ -137,7 +139,8 @@ def write_renders(folder: Path, surfels: SurfelMap, trajectory: Trajectory, came
     }
     places["overview"] = overview_pose(surfels, trajectory, view_camera)
     # What was seen about once is mostly noise at edges; a run too short to confirm anything shows all it has.
-    least = PICTURE_CONFIDENCE if np.median(surfels.confidences) > 2 * PICTURE_CONFIDENCE else 0.0
+    typical = np.median(surfels.sample(_SAMPLED)["confidence"])
+    least = PICTURE_CONFIDENCE if typical > 2 * PICTURE_CONFIDENCE else 0.0
     for name, T_world_camera in places.items():
         picture = render_picture(surfels, T_world_camera, view_camera, min_confidence=least)
         for kind, image in (("rgb", picture.color), ("normals", picture.normal_colors(T_world_camera))):
@@ -149,7 +152,8 @@ def overview_pose(surfels: SurfelMap, trajectory: Trajectory, camera: PinholeCam
     poses = trajectory.T_world_camera
     up = -poses[:, :3, 1].mean(axis=0)
     up /= max(float(np.linalg.norm(up)), 1e-9)
-    points = surfels.positions_m[:, :: max(1, len(surfels) // 20_000)].T.astype(np.float64)
+    sample = surfels.sample(_SAMPLED)
+    points = np.stack([sample[axis] for axis in "xyz"], axis=1).astype(np.float64)
     low, high = np.percentile(points, [2, 98], axis=0)
     centre, size = (low + high) / 2, float(np.linalg.norm(high - low))
     back = poses[:, :3, 3].mean(axis=0) - centre

@@ -18,9 +18,9 @@ from scanweld.errors import DatasetError, FileFormatError
 from scanweld.geometry.camera import PinholeCamera
 from scanweld.io.trajectory_files import read_trajectory
 from scanweld.refinement.calibration import DepthCorrection
-from scanweld.report.run_files import FrameTable, poses_of_frames, read_frames
+from scanweld.report.run_files import FrameTable, check_run_folder, poses_of_frames, read_frames
 from scanweld.runs.calibrated import CalibratedSequence
-from scanweld.runs.folder import KIND, MARK
+from scanweld.runs.folder import MARK
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,9 +49,8 @@ def read_description(folder: Path) -> Mapping[str, Any]:
     FileFormatError
         When the folder is no run folder.
     """
+    check_run_folder(folder, [MARK])
     path = folder / MARK
-    if not path.is_file():
-        raise FileFormatError(f"{folder}: is no {KIND} (no {MARK}); `scanweld slam SEQUENCE --out RUN` makes one")
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, ValueError) as error:

@@ -6,25 +6,28 @@ import contextlib
 import logging
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from scanweld.arrays import Float64
-from scanweld.datasets.base import RgbdSequence
+from scanweld.arrays import Float32, Float64
+from scanweld.datasets.base import LiveSequence, RgbdSequence
 from scanweld.datasets.gyroscope import gyroscope_of
 from scanweld.datasets.images import check_depth_unit, explain_unusable_depth
 from scanweld.datasets.stream import stream
 from scanweld.errors import DatasetError, InvalidInputError
 from scanweld.evaluation.surface_metrics import compression_ratio
 from scanweld.evaluation.trajectory_metrics import AteResult, ate, rpe
+from scanweld.geometry.frame import Frame
+from scanweld.notebook import BAD, DOUBTFUL, GOOD, card
 from scanweld.refinement.refine import Refinement
 from scanweld.runs.calibrated import CalibratedSequence
 from scanweld.runs.folder import check_writable, write_folder
 from scanweld.runs.interrupts import Patience
+from scanweld.runs.observer import RunObserver
 from scanweld.runs.output import write_run
 from scanweld.runs.refining import calibrate as calibrate_camera
 from scanweld.runs.refining import described
@@ -35,9 +38,13 @@ from scanweld.trajectory import FrameResult, FrameState, Trajectory
 logger = logging.getLogger(__name__)
 
 Progress = Callable[[FrameResult], None]
+AfterFrame = Callable[[Slam, Frame | None, FrameResult], None]
 
 UNIT_CHECK_FRAMES = 5
 """Frames whose depth is looked at for a wrong unit."""
+
+HELD_S = 0.1
+"""A run that is held looks this often whether it is to end."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,6 +75,26 @@ class RunSummary:
         posed_at_end = [r for r in self.results if r.state is not FrameState.UNREADABLE]
         return bool(posed_at_end) and posed_at_end[-1].state in POSED and 2 * tracked >= len(self.results)
 
+    def __repr__(self) -> str:
+        m = self.metrics
+        return f"<RunSummary {m['frames_tracked']} of {m['frames']} frames tracked, {len(self.map):,} surfels>"
+
+    def _repr_html_(self) -> str:
+        """Show what the run came to in a notebook."""
+        m, ate_m = self.metrics, self.metrics["ate_rmse_m"]
+        mark = BAD if not self.trustworthy else DOUBTFUL if m["frames_lost"] or self.interrupted else GOOD
+        rows = [
+            ("interrupted", "yes; what was done by then was kept" if self.interrupted else ""),
+            ("lost", f"{m['frames_lost']} frames, found again {m['relocalisations']}x" if m["frames_lost"] else ""),
+            ("unreadable", f"{m['frames_unreadable']} frames" if m["frames_unreadable"] else ""),
+            ("path", f"{m['path_length_m']:.2f} m"),
+            ("ATE", f"{1e3 * ate_m:.2f} mm" if ate_m is not None else "no ground truth"),
+            ("loops", f"{m['loop_closures']} closed" if m["loop_closures"] else ""),
+            ("map", f"{m['num_surfels']:,} surfels"),
+            ("written", f"{self.folder}/" if self.folder is not None else ""),
+        ]
+        return card(f"Run: {m['frames_tracked']} of {m['frames']} frames tracked", rows, mark=mark)
+
 
 @dataclass(slots=True)
 class _Tally:
@@ -82,6 +109,70 @@ class _Tally:
         logger.warning(message)
         self.warnings.append(message)
 
+    def count(self, index: int, depth_m: Float32, depth_scale: float) -> None:
+        """Count what a frame measured, and doubt the unit of the first ones once."""
+        self.num_points_input += int(np.count_nonzero(depth_m))
+        if index < UNIT_CHECK_FRAMES and not self.unit_doubted and depth_m.any():
+            self.median_depth_m = float(np.median(depth_m[depth_m > 0]))
+            advice = check_depth_unit(self.median_depth_m, depth_scale)
+            if advice:
+                self.unit_doubted = True
+                self.warn(advice)
+
+
+@dataclass(slots=True)
+class _Run:
+    """A run so far. An interruption at any time leaves it whole: map and sequence are of the same camera."""
+
+    sequence: RgbdSequence
+    config: SlamConfig
+    slam: Slam
+    tally: _Tally = field(default_factory=_Tally)
+    refinements: list[Refinement] = field(default_factory=list)
+    interrupted: bool = False
+
+    @property
+    def tracked(self) -> bool:
+        """Whether any frame has a pose."""
+        return any(result.state in POSED for result in self.slam.results)
+
+    def calibrate(self, after_frame: AfterFrame) -> None:
+        """Calibrate the camera, and where that helps run once more with it."""
+        calibrated, found = calibrate_camera(self.slam, self.sequence, self.config.refinement)
+        self.refinements.append(found)
+        if found.recalibrated:
+            again = build_slam(calibrated.camera, self.config)
+            _process_all(again, calibrated, _Tally(), None, after_frame)
+            self.slam, self.sequence = again, calibrated
+
+    def refine(self) -> None:
+        """Adjust the keyframes to each other; the camera stays as it is."""
+        poses_alone = replace(self.config.refinement, calibrate_intrinsics=False, calibrate_depth=False)
+        self.refinements.append(self.slam.refine(self.sequence.camera, poses_alone))
+
+    def interrupt(self) -> None:
+        """End here."""
+        self.interrupted = True
+        self.tally.warn(f"interrupted after {len(self.slam.results)} of {len(self.sequence)} frames")
+
+    def check_map(self) -> None:
+        """Raise DatasetError when nothing has been mapped; frames at given poses need no surfaces."""
+        if self.tracked and len(self.slam.map) > 0:
+            return
+        usable_m = (0.0, self.config.surfaces.max_depth_m)
+        why = explain_unusable_depth(self.tally.median_depth_m, self.sequence.depth_scale, usable_m)
+        raise DatasetError(f"{self.sequence.name}: no frame has usable depth, the map is empty; {why}")
+
+    def describe(self, description: Mapping[str, Any], *, calibrate: bool) -> dict[str, Any]:
+        """Return a description with what became of the run; `calibrate`: whether that was asked for."""
+        return {
+            **description,
+            "warnings": [*description.get("warnings", ()), *self.tally.warnings],
+            "interrupted": self.interrupted,
+            **({"calibrated": isinstance(self.sequence, CalibratedSequence)} if calibrate else {}),
+            **({"refinements": described(self.refinements)} if self.refinements else {}),
+        }
+
 
 def run_sequence(
     sequence: RgbdSequence,
@@ -91,6 +182,7 @@ def run_sequence(
     force: bool = False,
     poses: Trajectory | None = None,
     progress: Progress | None = None,
+    observers: Sequence[RunObserver] = (),
     tracked_only: bool = False,
     calibrate: bool = False,
     refine: bool = False,
@@ -107,6 +199,7 @@ def run_sequence(
     force : replace an existing run
     poses : fuse at these T_world_camera instead of tracking; frames without one within 0.02 s are skipped
     progress : called after each frame
+    observers : look on, and may hold the run between two frames
     tracked_only : leave lines of frames without a measured pose out of trajectory.txt
     calibrate : estimate intrinsics and depth from the keyframes, and where that helps run once more with them
     refine : adjust the keyframes in the end; map and trajectory move with them (docs/refinement.md)
@@ -122,69 +215,70 @@ def run_sequence(
     InvalidInputError
         When no given pose belongs to a frame, or given poses are to be refined.
     """
+    if isinstance(sequence, LiveSequence) and (calibrate or poses is not None):
+        raise InvalidInputError(
+            f"{sequence.name}: a live camera cannot be run again or at given poses; record it first"
+        )
     if poses is not None and (calibrate or refine):
         raise InvalidInputError("poses: given poses are not refined; leave out either poses, or refine and calibrate")
     started = time.perf_counter() if started is None else started
     config = config or SlamConfig()
     if out is not None:
         check_writable(out, force=force)
-    with Patience() as patience:  # a frame is in the map and in the trajectory, or in neither
+    with Patience() as patience:
+
+        def after_frame(slam: Slam, frame: Frame | None, result: FrameResult) -> None:
+            if progress is not None:
+                progress(result)
+            for observer in observers:
+                observer.on_frame(slam, frame, result)
+            patience.check()  # only here: a frame is in the map and in the trajectory, or in neither
+            while not all(observer.ready(HELD_S) for observer in observers):
+                patience.check()
+
         given = None if poses is None else _poses_by_frame(sequence, poses)
-        slam = build_slam(sequence.camera, config)
-        tally = _Tally()
-        interrupted = False
-        refinements: list[Refinement] = []
+        placed = _beside(config, out)
+        run = _Run(sequence, placed, build_slam(sequence.camera, placed))
         try:
-            _process_all(slam, sequence, given, tally, progress, patience)
+            _process_all(run.slam, sequence, run.tally, given, after_frame)
             if calibrate:
-                calibrated, found = calibrate_camera(slam, sequence, config.refinement)
-                refinements.append(found)
-                if found.recalibrated:
-                    again = build_slam(calibrated.camera, config)
-                    _process_all(again, calibrated, None, _Tally(), progress, patience)
-                    slam, sequence = again, calibrated  # together: an interrupted second run leaves the first
+                run.calibrate(after_frame)
             if refine:
-                poses_alone = replace(config.refinement, calibrate_intrinsics=False, calibrate_depth=False)
-                refinements.append(slam.refine(sequence.camera, poses_alone))
+                run.refine()
         except KeyboardInterrupt:
-            if not any(result.state in POSED for result in slam.results):
+            if not run.tracked:
                 raise  # there is nothing to keep
-            interrupted = True
-            tally.warn(f"interrupted after {len(slam.results)} of {len(sequence)} frames")
-        tracked = any(result.state in POSED for result in slam.results)
-        if not tracked or len(slam.map) == 0:  # frames at given poses need no surfaces
-            why = explain_unusable_depth(tally.median_depth_m, sequence.depth_scale, (0.0, config.surfaces.max_depth_m))
-            raise DatasetError(f"{sequence.name}: no frame has usable depth, the map is empty; {why}")
-        metrics, error = summarise(slam, sequence.ground_truth, tally.num_points_input)
+            if not isinstance(sequence, LiveSequence):  # which has no other end
+                run.interrupt()
+        for observer in observers:
+            observer.on_end(run.slam)
+        run.check_map()
+        metrics, error = summarise(run.slam, run.sequence.ground_truth, run.tally.num_points_input)
         metrics["seconds_total"] = time.perf_counter() - started
-        summary = RunSummary(out, metrics, tuple(slam.main_results), slam.map, interrupted, tuple(refinements))
         if out is not None:
             with write_folder(out, force=force) as aside:
                 write_run(
-                    aside, slam, sequence, config, metrics, error,
-                    tracked_only=tracked_only,
-                    description={
-                        **(description or {}),
-                        "warnings": [*(description or {}).get("warnings", ()), *tally.warnings],
-                        "interrupted": interrupted,
-                        **({"calibrated": isinstance(sequence, CalibratedSequence)} if calibrate else {}),
-                        **({"refinements": described(refinements)} if refinements else {}),
-                    },
-                    started=started,
+                    aside, run.slam, run.sequence, config, metrics, error, tracked_only=tracked_only,
+                    description=run.describe(description or {}, calibrate=calibrate), started=started,
                 )  # fmt: skip
-        return summary
+        results, refinements = tuple(run.slam.main_results), tuple(run.refinements)
+        return RunSummary(out, metrics, results, run.slam.map, run.interrupted, refinements)
+
+
+def _beside(config: SlamConfig, out: Path | None) -> SlamConfig:
+    """Keep what of the map does not fit in memory where the run will be written, unless the user says where."""
+    if config.map.folder or out is None:
+        return config
+    folder = next(parent for parent in out.resolve().parents if parent.exists())
+    return replace(config, map=replace(config.map, folder=str(folder)))
 
 
 def _process_all(
-    slam: Slam,
-    sequence: RgbdSequence,
-    given: list[Float64 | None] | None,
-    tally: _Tally,
-    progress: Progress | None,
-    patience: Patience,
+    slam: Slam, sequence: RgbdSequence, tally: _Tally, given: list[Float64 | None] | None, after_frame: AfterFrame
 ) -> None:
+    """Walk through a sequence: track each frame, or take its given T_world_camera."""
     gyroscope = gyroscope_of(sequence)
-    turned = [None] * len(sequence) if gyroscope is None else gyroscope.orientations(sequence.timestamps_s)
+    turned = None if gyroscope is None else gyroscope.orientations(sequence.timestamps_s)
     # Two frames ahead: a prepared one of 640x480 holds 20 MB.
     with contextlib.closing(stream(sequence, 2, prepare=slam.prepare)) as records:
         for record in records:
@@ -195,20 +289,14 @@ def _process_all(
             elif given is not None and pose is None:
                 result = slam.skip(record.timestamp_s, "no given pose")
             else:
-                depth = record.frame.depth_m
-                tally.num_points_input += int(np.count_nonzero(depth))
-                if record.index < UNIT_CHECK_FRAMES and not tally.unit_doubted and depth.any():
-                    tally.median_depth_m = float(np.median(depth[depth > 0]))
-                    advice = check_depth_unit(tally.median_depth_m, sequence.depth_scale)
-                    if advice:
-                        tally.unit_doubted = True
-                        tally.warn(advice)
+                tally.count(record.index, record.frame.depth_m, sequence.depth_scale)
                 result = slam.process(
-                    record.frame, pyramid=record.prepared, T_world_camera=pose, orientation=turned[record.index]
+                    record.frame,
+                    pyramid=record.prepared,
+                    T_world_camera=pose,
+                    orientation=None if turned is None else turned[record.index],
                 )
-            if progress is not None:
-                progress(result)
-            patience.check()
+            after_frame(slam, record.frame, result)
 
 
 def _poses_by_frame(sequence: RgbdSequence, poses: Trajectory) -> list[Float64 | None]:
