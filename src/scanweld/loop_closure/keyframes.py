@@ -185,7 +185,7 @@ def keyframe_reason(
 def usable_share(pyramid: SurfacePyramid) -> float:
     """Return the share of the image that has surfaces."""
     level = pyramid.levels[0]
-    return float(np.count_nonzero(level.surface[::2, ::2, 6]) / level.depth_m[::2, ::2].size)
+    return float(np.count_nonzero(level.surface[::4, ::4, 6]) / level.depth_m[::4, ::4].size)
 
 
 def _reduced(frame: Frame, level: SurfaceLevel, halvings: int) -> Frame:

@@ -106,7 +106,8 @@ class KeyframeLoopCloser:
         self.database = KeyframeDatabase(self.config.places)
         self.num_closures = 0
         self.submap = 0
-        self._submaps: list[int] = []  # of each keyframe
+        self._submaps: Int64 = np.empty(0, np.int64)  # of each keyframe
+        self._newest: dict[int, int] = {}  # keyframe of each submap
         self._num_submaps = 1  # that there ever were
         self._joins = JoinFinder(self.config.drift, self.config.places.keyframes.surfaces)
         self._edges: list[_Edge] = []
@@ -115,7 +116,7 @@ class KeyframeLoopCloser:
     @property
     def keyframe(self) -> int:
         """The keyframe that new surfels and frames belong to."""
-        return int(max(self._members(), default=0))
+        return self._newest.get(self.submap, 0)
 
     @property
     def loops(self) -> list[tuple[int, int]]:
@@ -148,7 +149,7 @@ class KeyframeLoopCloser:
         found = relocalise(self.database.sight(pyramid), self.database, self.config.verification)
         if found.T_world_camera is None:
             return self.submap, replace(found.result, T_target_source=np.eye(4))
-        return self._submaps[found.keyframe], replace(found.result, T_target_source=found.T_world_camera)
+        return int(self._submaps[found.keyframe]), replace(found.result, T_target_source=found.T_world_camera)
 
     def begin_submap(self, pyramid: SurfacePyramid, T_world_camera: Float64, frame_index: int) -> int | None:
         """Begin a submap with a frame, its first keyframe; return its number, or None where the frame can be none.
@@ -172,7 +173,8 @@ class KeyframeLoopCloser:
         poses = [keyframe.T_world_camera for keyframe in self.database.keyframes]
         for index in moved:
             poses[index] = join.T_kept_joined @ poses[index]
-            self._submaps[index] = join.kept
+        self._submaps[moved] = join.kept
+        self._newest[join.kept] = int(self._members(join.kept)[-1])
         self.database.move(poses)
         # The first edge holds the two parts of the graph together, so it may not be dropped; the second may.
         self._edges += [
@@ -183,7 +185,7 @@ class KeyframeLoopCloser:
 
     def _in_submap(self, submap: int | None = None) -> Bool:
         """Return which keyframes (K,) are those of a submap, by default of the one that the camera is in."""
-        return np.asarray(np.array(self._submaps, np.int64) == (self.submap if submap is None else submap))
+        return np.asarray(self._submaps == (self.submap if submap is None else submap))
 
     def _members(self, submap: int | None = None) -> Int64:
         return np.flatnonzero(self._in_submap(submap))
@@ -192,7 +194,8 @@ class KeyframeLoopCloser:
         """Remember a frame in the submap at hand, with the motion from the keyframe before."""
         before = self._members()
         keyframe = self.database.add(sighting, T_world_camera, frame_index=frame_index)
-        self._submaps.append(self.submap)
+        self._submaps = np.append(self._submaps, self.submap)
+        self._newest[self.submap] = keyframe.index
         if len(before):
             self._edges.append(self._odometry(self.database[before[-1]], keyframe))
         self._seen_since = True
@@ -244,7 +247,7 @@ class KeyframeLoopCloser:
             edge = self._verified(sighting, keyframe, candidate.index)
             if edge is not None:
                 pair = PlacePair(edge.i, edge.j, edge.T_i_j, edge.information)
-                join = self._joins.add(pair, self.database.keyframes, self._submaps)
+                join = self._joins.add(pair, self.database.keyframes, self._submaps.tolist())
                 if join is not None:
                     return join
         return None

@@ -100,10 +100,15 @@ class KeyframeDatabase:
 
         `among` : (K,) bool, the keyframes of its own world, which it is compared with; all by default.
         """
-        mine = np.ones(len(self), np.bool_) if among is None else np.asarray(among, np.bool_)
-        similarity = float(self.similarities(self.ferns.encode(pyramid))[mine].max(initial=0.0))
-        last = self._keyframes[int(np.flatnonzero(mine)[-1])] if mine.any() else None
-        return keyframe_reason(pyramid, T_world_camera, last, similarity, self.config.keyframes)
+        mine = np.arange(len(self)) if among is None else np.flatnonzero(among)
+        if len(mine) == 0:
+            return keyframe_reason(pyramid, T_world_camera, None, 0.0, self.config.keyframes)
+        code, newest = self.ferns.encode(pyramid), int(mine[-1])
+        # Mostly the frame is like the newest keyframe, and the others need not be asked.
+        similarity = float(self.similarities(code, slice(newest, newest + 1))[0])
+        if similarity < self.config.keyframes.max_similarity:
+            similarity = float(self.similarities(code)[mine].max())
+        return keyframe_reason(pyramid, T_world_camera, self[newest], similarity, self.config.keyframes)
 
     def add(self, sighting: Sighting, T_world_camera: Float64, *, frame_index: int) -> Keyframe:
         """Remember a frame that was seen from `T_world_camera`.
@@ -139,10 +144,10 @@ class KeyframeDatabase:
             for keyframe, T in zip(self._keyframes, T_world_camera, strict=True)
         ]
 
-    def similarities(self, code: FernCode) -> Float64:
-        """Return the share (K,) of ferns that agree with each keyframe."""
-        codes = self._codes[: len(self)]
-        return similarities(code, codes[:, 0], codes[:, 1], self._has_grey[: len(self)])
+    def similarities(self, code: FernCode, some: slice = slice(None)) -> Float64:
+        """Return the share (K,) of ferns that agree with each keyframe, or with each of some."""
+        codes = self._codes[: len(self)][some]
+        return similarities(code, codes[:, 0], codes[:, 1], self._has_grey[: len(self)][some])
 
     def shared_words(self, descriptors: UInt8) -> Int32:
         """Count (K,) the words of each keyframe's features that features with `descriptors` (N, 32) have too."""

@@ -91,4 +91,4 @@ class PipelinedMapper:
 
 def _is_settled(view: ModelView | None) -> bool:
     """Whether most of a view is stable: what is younger changes from frame to frame, and is worth waiting for."""
-    return view is not None and 2 * np.count_nonzero(view.confidences >= view.stable_confidence) > len(view)
+    return view is not None and bool(2 * np.count_nonzero(view.confidences >= view.stable_confidence) > len(view))

@@ -85,7 +85,10 @@ class ProjectiveConfig:
 
 @dataclass(frozen=True, slots=True)
 class ProjectiveStep:
-    """Sums of one iteration; residuals in standard deviations of the depth noise. `shares` add up to `equations`."""
+    """Sums of one iteration; residuals in standard deviations of the depth noise.
+
+    `partials` (K, SUMS) are those of the shares, see :class:`~.backends.ProjectiveBackend`.
+    """
 
     level: int
     equations: NormalEquations
@@ -94,7 +97,12 @@ class ProjectiveStep:
     num_inliers: int
     num_matched: int
     num_projected: int
-    shares: GeometricSums
+    partials: Float64
+
+    @property
+    def shares(self) -> GeometricSums:
+        """The equations of each share of the points; they add up to `equations`."""
+        return _as_equations(self.partials)
 
 
 def projective_step(
@@ -122,20 +130,20 @@ def projective_step(
     """
     partials = _partial_sums(positions_m, normals, T_target_source, target, gate_m, config, parts)
     sums = partials.sum(axis=0)
-    shares = _as_equations(partials)
-    information = shares.information.sum(axis=0)
+    whole = _as_equations(sums[None])
+    information, gradient = whole.information[0], whole.gradient[0]
     # Unit normals: the translation block's trace is the sum of the weights w / sigma^2.
     weight = float(np.trace(information[:3, :3]))
     matched = int(sums[30])
     return ProjectiveStep(
         level,
-        NormalEquations(information, shares.gradient.sum(axis=0), weight, centroid_m, radius_m),
+        NormalEquations(information, gradient, weight, centroid_m, radius_m),
         loss=float(sums[28] / matched) if matched else 0.0,
         rmse_m=float(np.sqrt(max(sums[27], 0.0) / weight)) if weight > 0 else 0.0,
         num_inliers=int(sums[29]),
         num_matched=matched,
         num_projected=int(sums[31]),
-        shares=shares,
+        partials=partials,
     )
 
 
@@ -159,10 +167,13 @@ def _partial_sums(
     )
 
 
+_UPPER = np.triu_indices(7)
+
+
 def _as_equations(partials: Float64) -> GeometricSums:
     """Return the normal equations of each share."""
     full = np.zeros((len(partials), 7, 7))
-    rows, columns = np.triu_indices(7)
+    rows, columns = _UPPER
     full[:, rows, columns] = full[:, columns, rows] = partials[:, :28]
     return GeometricSums(full[:, :6, :6], full[:, :6, 6])
 

@@ -17,6 +17,9 @@ from scanweld.trajectory import FrameResult, FrameState, Trajectory
 POSED = (FrameState.TRACKING, FrameState.RELOCALISED)
 """States whose pose was measured."""
 
+UNSEEN = (FrameState.UNREADABLE, FrameState.DROPPED)
+"""States of frames that nobody has looked at."""
+
 
 CARRIED = 3.0
 """Times the speed before a loss: a camera that is found further away was moved in another way than before."""

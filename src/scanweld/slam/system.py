@@ -29,7 +29,7 @@ from scanweld.refinement.config import RefinementConfig
 from scanweld.refinement.refine import Refinement, refine_keyframes
 from scanweld.registration.result import RegistrationResult, Status
 from scanweld.slam.health import HealthConfig, TrackingHealth, is_near
-from scanweld.slam.motion import POSED, ConstantVelocity, trajectory_of
+from scanweld.slam.motion import POSED, UNSEEN, ConstantVelocity, trajectory_of
 from scanweld.slam.rotation_aid import RotationAid, as_rotation
 from scanweld.slam.stages import LoopCloser, Mapper, Tracker
 from scanweld.slam.submaps import Atlas, SubmapConfig, in_one_world, main_submap
@@ -224,6 +224,19 @@ class Slam:
             )
         )
 
+    def drop(self, timestamp_s: float, reason: str) -> FrameResult:
+        """Note a frame that is not looked at, to keep pace; to the motion model it is none at all."""
+        self._check_time(timestamp_s)
+        return self._keep(
+            FrameResult(
+                index=len(self._results),
+                timestamp_s=timestamp_s,
+                state=FrameState.DROPPED,
+                T_world_camera=self._motion.predict(timestamp_s) if self._has_map else self._T_world_first,
+                note=reason,
+            )
+        )
+
     def refine(
         self, camera: PinholeCamera, config: RefinementConfig | None = None, *, apply: bool = True
     ) -> Refinement:
@@ -288,8 +301,8 @@ class Slam:
         return result
 
     def _lost_for(self) -> int:
-        """Number of frames since the camera was last tracked."""
-        return len(self._results) - 1 - self._last_posed
+        """Number of frames since the camera was last tracked, without those that were dropped."""
+        return sum(result.state is not FrameState.DROPPED for result in self._results[self._last_posed + 1 :])
 
     def _found_again(self, pyramid: SurfacePyramid, predicted: Float64) -> FrameResult:
         """Look for a lost camera among the places that are known, and align it with the map there."""
@@ -401,7 +414,7 @@ class Slam:
         lost = bool(doubt) or not aligned.status.has_pose
         if not lost:
             self._health.observe(aligned, predicted)
-        looked_at = (r.state for r in reversed(self._results) if r.state is not FrameState.UNREADABLE)
+        looked_at = (r.state for r in reversed(self._results) if r.state not in UNSEEN)
         was_lost = next(looked_at, None) is FrameState.LOST
         state = FrameState.LOST if lost else FrameState.RELOCALISED if was_lost else FrameState.TRACKING
         return FrameResult(

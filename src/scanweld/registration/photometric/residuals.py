@@ -91,6 +91,9 @@ def half_grey(grey: Float32) -> Float32:
     return np.ascontiguousarray((even[::2, ::2] + even[1::2, ::2] + even[::2, 1::2] + even[1::2, 1::2]) / 4)
 
 
+_UPPER = np.triu_indices(kernels.COLUMNS)
+
+
 def photometric_sums(
     points: LitPoints,
     target: LitTarget,
@@ -117,7 +120,7 @@ def photometric_sums(
 
     run_ranges(parts, body)
     full = np.zeros((parts, kernels.COLUMNS, kernels.COLUMNS))
-    rows, columns = np.triu_indices(kernels.COLUMNS)
+    rows, columns = _UPPER
     full[:, rows, columns] = partials[:, :45]
     full[:, columns, rows] = partials[:, :45]
     return PhotometricSums(full[:, :8, :8], full[:, :8, 8], partials[:, 45], partials[:, 46].astype(np.int64))
@@ -189,11 +192,11 @@ def estimate_brightness(
     model, frame = rows.model, rows.frame
     if len(model) < MIN_SAMPLES:
         return None
-    gain, offset = 1.0, float(np.median(frame - model))
+    gain, offset = 1.0, _median(frame - model)
     scale = MIN_SCALE
     for _ in range(4):
         residuals = gain * model + offset - frame
-        scale = max(MIN_SCALE, 1.4826 * float(np.median(np.abs(residuals - np.median(residuals)))))
+        scale = max(MIN_SCALE, 1.4826 * _median(np.abs(residuals - _median(residuals))))
         weights = (FREEDOM + 1) / (FREEDOM + (residuals / scale) ** 2) / scale**2
         total = weights.sum()
         mean_model, mean_frame = (weights @ model) / total, (weights @ frame) / total
@@ -201,6 +204,11 @@ def estimate_brightness(
         gain = float((weights @ ((model - mean_model) * (frame - mean_frame)) + 1 / GAIN_STD**2) / spread)
         offset = float(mean_frame - gain * mean_model)
     return Brightness(gain, offset, scale)
+
+
+def _median(values: Float64) -> float:
+    """Return the upper median: `np.median` takes longer for its checks than to find it."""
+    return float(np.partition(values, len(values) // 2)[len(values) // 2])
 
 
 @dataclass(frozen=True, slots=True)
