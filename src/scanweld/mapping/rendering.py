@@ -18,8 +18,11 @@ from scanweld.mapping.backends.arrays import FARTHEST_M, NEAREST_M, DepthBuffers
 from scanweld.mapping.surfel_map import SurfelMap
 from scanweld.parallel import run_ranges
 
-VIEW_MARGIN_PIXELS = 64.0
-"""Surfels this far outside the image are kept for a camera that moves a little."""
+VIEW_MARGIN_PIXELS = 1.0
+"""Surfels this far outside the image are looked at: they are rounded to pixels."""
+
+DISC_MARGIN_PIXELS = 64.0
+"""Discs this far outside the image may reach into it."""
 
 
 def frustum(T_world_camera: Float64, camera: PinholeCamera, margin_pixels: float, far_m: float) -> Float64:
@@ -125,7 +128,7 @@ def render_picture(
         )
 
     # Part by part: all of a map may be in view, and more than fits in memory.
-    for slots in pages.batches(pages.cull(frustum(T_world_camera, camera, VIEW_MARGIN_PIXELS, FARTHEST_M))):
+    for slots in pages.batches(pages.cull(frustum(T_world_camera, camera, DISC_MARGIN_PIXELS, FARTHEST_M))):
         run_ranges(-(-camera.height // rows), partial(body, slots=slots))
     return Picture(depth, np.clip(np.rint(rgb), 0, 255).astype(np.uint8), normals)
 
