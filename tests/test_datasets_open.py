@@ -62,16 +62,19 @@ def test_each_layout_is_recognised_by_its_own_format_first(tmp_path: Path) -> No
     files = {
         "scannet": write_sens(tmp_path / "a/scene.sens"),
         "record3d": write_record3d(tmp_path / "c/a.r3d", {}),
+        "realsense": tmp_path / "q/a.bag",
         "rosbag": tmp_path / "d/a.bag",
     }
-    (tmp_path / "d").mkdir()
-    files["rosbag"].touch()
+    for name, content in (("realsense", b"#ROSBAG V2.0\n/file_version"), ("rosbag", b"")):
+        files[name].parent.mkdir()
+        files[name].write_bytes(content)
     folders |= {name: file.parent for name, file in files.items()}
     assert set(folders) == {row.name for row in FORMATS}
     for name, folder in folders.items():
         assert next(row.name for row in FORMATS if row.recognises(folder)) == name
     for name, file in files.items():
-        assert [row.name for row in FORMATS if file.suffix in row.suffixes] == [name]
+        fits = [row for row in FORMATS if file.suffix in row.suffixes]
+        assert next(row.name for row in fits if row.recognises(file)) == name
 
 
 def test_a_folder_named_like_icl_with_its_own_truth_is_taken_as_it_is(tmp_path: Path) -> None:

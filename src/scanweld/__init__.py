@@ -10,6 +10,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from scanweld.backends import set_backend
     from scanweld.config import from_mapping, to_toml
     from scanweld.datasets.base import RgbdSequence
     from scanweld.datasets.gyroscope import Gyroscope
@@ -87,6 +88,7 @@ if TYPE_CHECKING:
     from scanweld.trajectory import FrameResult, FrameState, Trajectory
 
 _HOME = {
+    "backends": ("set_backend",),
     "config": ("from_mapping", "to_toml"),
     "datasets.base": ("RgbdSequence",),
     "datasets.open": ("open_sequence",),
@@ -246,6 +248,7 @@ __all__ = [
     "rpe",
     "run_sequence",
     "se3",
+    "set_backend",
     "set_num_threads",
     "stream",
     "surface_accuracy",

@@ -77,6 +77,7 @@ class FrameState(Enum):
     LOST = "lost"  # its pose is the motion model's; it was not fused
     RELOCALISED = "relocalised"
     UNREADABLE = "unreadable"  # it could not be decoded; its pose is interpolated
+    DROPPED = "dropped"  # it was not looked at, to keep pace with the recording; its pose is interpolated
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

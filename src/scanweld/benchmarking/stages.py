@@ -95,7 +95,7 @@ class _TimedMapper(SurfelMapper):
         with self._clock.stage("view"):
             seen = super().view(*arguments, **options)
         self._seen = len(seen)
-        if seen is not self._fused:  # what fusion saw costs nothing more
+        if seen is not self.last_seen:  # what fusion saw costs nothing more
             self._clock.bytes_moved["view"] += self._seen * (FUSED_BYTES + VIEWED_BYTES) + seen.index_map.nbytes
         return seen
 

@@ -12,7 +12,7 @@ from rich.logging import RichHandler
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, TextColumn, TimeRemainingColumn
 from rich.table import Column
 
-from scanweld.trajectory import FrameResult
+from scanweld.trajectory import FrameResult, FrameState
 
 QUIET_INTERVAL_S = 5.0
 """Without a terminal, a line is printed this often."""
@@ -36,7 +36,8 @@ def _bar(console: Console, *details: ProgressColumn) -> Progress:
 
 
 class FrameProgress:
-    """Shows frames, frames per second, state and surfels of a run, of which each pass begins with frame 0.
+    """Shows frames, frames per second, state and surfels of a run, of which each pass begins with frame 0, and how many
+    frames were dropped.
 
     `then` is said when the frames of the first pass are done, where something follows that takes its time.
     """
@@ -45,7 +46,7 @@ class FrameProgress:
         self.total, self.title, self.then = total, title, then
         self._console = Console(stderr=True)
         self._live = self._console.is_terminal
-        self._done = 0
+        self._done = self._dropped = 0
         self._first = self._spoken = time.perf_counter()
 
     def __enter__(self) -> FrameProgress:
@@ -73,12 +74,16 @@ class FrameProgress:
             if self._done:
                 self.title += " again"
                 self._bar.reset(self._task, description=self.title)
-            self._done, self._first = 0, now
+            self._done, self._dropped, self._first = 0, 0, now
         self._done += 1
-        fps = (self._done - 1) / (now - self._first) if self._done > 1 else 0.0
+        self._dropped += result.state is FrameState.DROPPED
+        taken = self._done - self._dropped
+        fps = (taken - 1) / (now - self._first) if taken > 1 else 0.0
         detail = f"{fps:5.1f} fps  {result.state.name}"
         if not self._live or _is_wide(self._console):
             detail = f"{detail:<22}  {result.num_surfels / 1e3:,.0f}k surfels"
+        if self._dropped:
+            detail += f"  {self._dropped} dropped"
         if self._live:
             self._bar.update(self._task, advance=1, detail=detail)
         elif now - self._spoken > QUIET_INTERVAL_S:

@@ -64,6 +64,9 @@ def slam(
         bool, Option("--calibrate", help="Estimate intrinsics and depth offset, then run again with them.")
     ] = False,
     refine: Annotated[bool, Option("--refine", help="Adjust all keyframes together in the end.")] = False,
+    realtime: Annotated[
+        bool, Option("--realtime", help="Play the recording at its own speed; drop frames instead of falling behind.")
+    ] = False,
     view: Annotated[bool, Option("--view", help="Show the run in the browser while it goes by.")] = False,
     view_host: Annotated[
         str, Option(help="Where --view listens; others than this machine need the token of its address.")
@@ -108,7 +111,8 @@ def slam(
     with opened_observers(opened.name, view=view, host=view_host, port=view_port, rerun=rerun) as observers:
         summary = run_with_progress(
             opened, settings, folder, force=force, poses=given, threads=threads, tracked_only=tracked_only,
-            calibrate=calibrate, refine=refine, observers=observers.all, description=description, started=started,
+            calibrate=calibrate, refine=refine, realtime=realtime, observers=observers.all, description=description,
+            started=started,
         )  # fmt: skip
         code = print_summary(summary, json_output=json_output)
         if not summary.interrupted:
@@ -214,6 +218,7 @@ def summary_text(summary: RunSummary) -> str:
     m = summary.metrics
     lost = [f"{m['frames_lost']} lost"] if m["frames_lost"] else []
     lost += [f"{m['frames_unreadable']} unreadable"] if m["frames_unreadable"] else []
+    lost += [f"{m['frames_dropped']} dropped to keep pace"] if m.get("frames_dropped") else []
     rows = [
         ("frames", f"{m['frames_tracked']} of {m['frames']} tracked" + "".join(f", {x}" for x in lost)),
         ("map", f"{m['num_surfels']:,} surfels from {m['num_points_input']:,} points"),

@@ -75,6 +75,19 @@ class RgbdSequence(Protocol):
         ...
 
 
+@runtime_checkable
+class LiveSequence(RgbdSequence, Protocol):
+    """A camera: its frames come when they come, once, and have no end. What it says of times and length is so far."""
+
+    def live(self) -> Iterator[Frame]:
+        """Yield the newest frame whenever one is asked for; those that nobody asked for in time are dropped."""
+        ...
+
+    def close(self) -> None:
+        """Let go of the camera; `live` ends."""
+        ...
+
+
 def readable_frames(sequence: RgbdSequence) -> Iterator[Frame]:
     """Yield the frames of a sequence that can be decoded; log the others.
 

@@ -12,6 +12,8 @@ from scanweld.datasets.base import RgbdSequence
 from scanweld.datasets.bundle_fusion import is_bundle_fusion, open_bundle_fusion
 from scanweld.datasets.icl_nuim import has_icl_nuim_files, is_icl_nuim, open_icl_nuim
 from scanweld.datasets.intrinsics import Intrinsics, Overrides
+from scanweld.datasets.realsense import LIVE, is_realsense, open_realsense, open_realsense_camera
+from scanweld.datasets.realsense import SUFFIXES as REALSENSE_SUFFIXES
 from scanweld.datasets.record3d import is_record3d, open_record3d
 from scanweld.datasets.redwood import empty_image_folders, is_redwood, open_redwood
 from scanweld.datasets.replica import is_replica, open_replica
@@ -109,6 +111,14 @@ FORMATS = (
         open_redwood,
     ),
     SequenceFormat(
+        "realsense",
+        "a .bag or .db3 file of the RealSense SDK",
+        is_realsense,
+        is_realsense,
+        open_realsense,
+        REALSENSE_SUFFIXES,
+    ),
+    SequenceFormat(
         "rosbag",
         "a .bag, .mcap or .db3 file, or metadata.yaml of ROS 2",
         is_ros_bag,
@@ -149,7 +159,8 @@ def open_sequence(
 
     Parameters
     ----------
-    path : the sequence folder, or a folder with the sequence folder alone in it; a file where the format is one
+    path : the sequence folder, or a folder with the sequence folder alone in it; a file where the format is one;
+        "realsense:" or "realsense:SERIAL" for a camera
     format : a name of ``FORMATS``, or "auto"
     camera : intrinsics of the images on disk; fx, fy, cx, cy are enough. Default: camera.json, else the
         format's
@@ -170,6 +181,9 @@ def open_sequence(
     MissingDependencyError
         When the format needs an extra that is not installed.
     """
+    if str(path).startswith(LIVE):
+        overrides = Overrides(camera=camera, depth_scale=depth_scale, topics={})
+        return open_realsense_camera(str(path), overrides, frames, scale)
     place = Path(path)
     if not place.exists():
         raise DatasetError(f"{place}: no such folder")
@@ -201,12 +215,14 @@ def _format_of_file(file: Path, name: str) -> SequenceFormat:
     wanted, suffix = _known_name(name), file.suffix.lower()
     fits = [row for row in FORMATS if suffix in row.suffixes]
     if not fits:
-        files = ", ".join(suffix for row in FORMATS for suffix in row.suffixes)
+        files = ", ".join(dict.fromkeys(suffix for row in FORMATS for suffix in row.suffixes))
         hint = "; unpack it first" if suffix in (".zip", ".tgz", ".gz", ".tar", ".7z") else ""
         raise DatasetError(f"{file}: is a file, expected a sequence folder or one of {files}{hint}")
-    if wanted not in ("auto", fits[0].name):
-        raise DatasetError(f"{file}: not a sequence of format '{wanted}'; it looks like '{fits[0].name}'")
-    return fits[0]
+    found = next((row for row in fits if row.recognises(file)), fits[-1])
+    named = next((row for row in fits if row.name == wanted), None)  # a bag may be read in two ways
+    if wanted != "auto" and named is None:
+        raise DatasetError(f"{file}: not a sequence of format '{wanted}'; it looks like '{found.name}'")
+    return named or found
 
 
 def _find_format(folder: Path, name: str) -> tuple[SequenceFormat, Path]:
@@ -234,8 +250,9 @@ def _find_format(folder: Path, name: str) -> tuple[SequenceFormat, Path]:
         raise DatasetError(
             f"{folder}: not a sequence of format '{wanted}', which needs {named.layout}; it holds {_content(folder)}"
         )
-    layouts = "; ".join(f"{row.name}: {row.layout}" for row in FORMATS)
-    raise DatasetError(f"{folder}: not a sequence of a known format ({layouts}); it holds {_content(folder)}")
+    raise DatasetError(
+        f"{folder}: not a sequence of a known format (`scanweld datasets list` names them); it holds {_content(folder)}"
+    )
 
 
 def _content(folder: Path) -> str:

@@ -8,7 +8,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
-from scanweld.datasets.base import RgbdSequence, no_readable_frame
+from scanweld.datasets.base import LiveSequence, RgbdSequence, no_readable_frame
 from scanweld.errors import InvalidInputError, UnreadableFrameError
 from scanweld.geometry.frame import Frame
 
@@ -22,8 +22,9 @@ class FrameRecord:
     index : position in the sequence, from 0
     timestamp_s : [s]
     frame : the frame, or None where it cannot be decoded
-    error : why it cannot, else ""
+    error : why it cannot, or was not, else ""
     prepared : what `prepare` made of the frame; None where there is neither
+    dropped : the consumer was too slow for it; it was not read (:mod:`.playback`)
     """
 
     index: int
@@ -31,6 +32,7 @@ class FrameRecord:
     frame: Frame | None
     error: str = ""
     prepared: Any = None
+    dropped: bool = False
 
 
 def stream(
@@ -41,6 +43,8 @@ def stream(
     prepare: Callable[[Frame], Any] | None = None,
 ) -> Generator[FrameRecord]:
     """Yield a record for every frame, in order, while the next `lookahead` frames are being decoded.
+
+    Of a live camera nothing is read ahead: each record is of the newest frame, and the camera is closed in the end.
 
     Decoders release the GIL, so the consumer computes meanwhile. At most `lookahead` frames wait in memory.
     Closing the generator, or leaving the loop by an exception, ends the threads after the frame in work.
@@ -62,37 +66,49 @@ def stream(
     """
     if lookahead < 1 or num_threads < 1:
         raise InvalidInputError(f"stream: expected at least one frame and thread, got {lookahead} and {num_threads}")
+    if isinstance(sequence, LiveSequence):
+        return _live_records(sequence, prepare)
     return _records(sequence, lookahead, num_threads, prepare)
+
+
+def read_record(sequence: RgbdSequence, index: int, prepare: Callable[[Frame], Any] | None) -> FrameRecord:
+    """Read and prepare one frame."""
+    timestamp_s = float(sequence.timestamps_s[index])
+    try:
+        frame = sequence.read(index)
+    except UnreadableFrameError as error:
+        return FrameRecord(index, timestamp_s, None, str(error))
+    return FrameRecord(index, timestamp_s, frame, prepared=prepare(frame) if prepare else None)
+
+
+def _live_records(sequence: LiveSequence, prepare: Callable[[Frame], Any] | None) -> Generator[FrameRecord]:
+    try:
+        for index, frame in enumerate(sequence.live()):
+            yield FrameRecord(index, frame.timestamp_s, frame, prepared=prepare(frame) if prepare else None)
+    finally:
+        sequence.close()
 
 
 def _records(
     sequence: RgbdSequence, lookahead: int, num_threads: int, prepare: Callable[[Frame], Any] | None
 ) -> Generator[FrameRecord]:
-    timestamps_s = sequence.timestamps_s.tolist()
-
-    def record(index: int) -> FrameRecord:
-        try:
-            frame = sequence.read(index)
-        except UnreadableFrameError as error:
-            return FrameRecord(index, timestamps_s[index], None, str(error))
-        return FrameRecord(index, timestamps_s[index], frame, prepared=prepare(frame) if prepare else None)
-
+    count = len(sequence.timestamps_s)
     pending: deque[Future[FrameRecord]] = deque()
     first_fault, num_read = "", 0
     pool = ThreadPoolExecutor(max_workers=num_threads, thread_name_prefix="scanweld-decode")
     try:
-        for index in range(len(timestamps_s)):
-            while len(pending) < lookahead and index + len(pending) < len(timestamps_s):
-                pending.append(pool.submit(record, index + len(pending)))
+        for index in range(count):
+            while len(pending) < lookahead and index + len(pending) < count:
+                pending.append(pool.submit(read_record, sequence, index + len(pending), prepare))
             current = pending.popleft().result()
             # The slot that has just become free is filled before the consumer starts to compute.
             ahead = index + 1 + len(pending)
-            if ahead < len(timestamps_s):
-                pending.append(pool.submit(record, ahead))
+            if ahead < count:
+                pending.append(pool.submit(read_record, sequence, ahead, prepare))
             num_read += current.frame is not None
             first_fault = first_fault or current.error
             yield current
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
     if num_read == 0:
-        raise no_readable_frame(sequence.name, len(timestamps_s), first_fault)
+        raise no_readable_frame(sequence.name, count, first_fault)

@@ -35,7 +35,7 @@ function told(value) {
 }
 
 /** Name of the class of a kind of frame, "" for plainly tracked ones. */
-const KIND_CLASS = { t: "", l: "lost", u: "unreadable", r: "relocalised", d: "degenerate", m: "unfinished", e: "elsewhere" };
+const KIND_CLASS = { t: "", l: "lost", u: "unreadable", s: "dropped", r: "relocalised", d: "degenerate", m: "unfinished", e: "elsewhere" };
 
 /** Runs of frames that were not plainly tracked: [first, last, class]. */
 function bands() {

@@ -47,6 +47,7 @@ _KIND_LETTERS = {
     "": "t",
     "lost": "l",
     "unreadable": "u",
+    "dropped": "s",
     "relocalised": "r",
     "degenerate": "d",
     "unfinished": "m",

@@ -16,6 +16,7 @@ _BLUE = "#2563eb"
 SHADES = {
     "lost": "#dc2626",
     "unreadable": "#6b7280",
+    "dropped": "#9ca3af",
     "relocalised": "#0d9488",
     "degenerate": "#d97706",
     "unfinished": "#a16207",

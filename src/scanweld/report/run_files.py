@@ -40,7 +40,7 @@ class FrameTable:
     ----------
     number : (N,) number of the frame in the run
     timestamp_s : (N,) [s]
-    state : "tracking", "lost", "relocalised" or "unreadable"
+    state : "tracking", "lost", "relocalised", "unreadable" or "dropped"
     alignment : the aligner's status in lower case, "" where none ran
     note : why a frame was not plainly tracked, else ""
     rmse_m, inliers, overlap, surfels : (N,)

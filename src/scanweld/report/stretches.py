@@ -12,6 +12,7 @@ from scanweld.report.run_files import POSED_STATES, FrameTable
 KINDS = {
     "lost": "LOST",
     "unreadable": "UNREADABLE",
+    "dropped": "DROPPED",
     "relocalised": "RELOCALISED",
     "degenerate": "DEGENERATE",
     "unfinished": "UNFINISHED",
@@ -46,7 +47,7 @@ class Stretch:
 
 def kind_of(state: str, alignment: str) -> str:
     """Return what a frame was besides plainly tracked: a key of :data:`KINDS`, or "" for plainly tracked."""
-    if state in ("lost", "unreadable", "relocalised"):
+    if state in ("lost", "unreadable", "dropped", "relocalised"):
         return state
     return {"degenerate": "degenerate", "max_iterations": "unfinished"}.get(alignment, "")
 
@@ -61,14 +62,15 @@ def kinds_of(frames: FrameTable) -> list[str]:
 
 
 def find_stretches(frames: FrameTable) -> list[Stretch]:
-    """Return all stretches in order; a relocalised frame is told in the ending of the stretch before it."""
+    """Return all stretches in order; a relocalised frame is told in the ending of the stretch before it, and how many
+    frames were dropped in the verdict: they come one by one, all over a run."""
     kinds = kinds_of(frames)
     stretches: list[Stretch] = []
     first = 0
     for i in range(1, len(kinds) + 1):
         if i < len(kinds) and kinds[i] == kinds[first]:
             continue
-        if kinds[first] and kinds[first] != "relocalised":
+        if kinds[first] not in ("", "relocalised", "dropped"):
             stretches.append(_stretch(frames, kinds, first, i - 1))
         first = i
     return stretches

@@ -24,7 +24,7 @@ HEADLINES = {
 }
 
 DOUBTFUL_SHARE = 0.02
-"""Share of frames that are unreadable, degenerate or unfinished from which on it is a reservation."""
+"""Share of frames that are unreadable, dropped, degenerate or unfinished from which on it is a reservation."""
 
 DOUBTFUL_ERROR_M, DOUBTFUL_ERROR = 0.02, 0.01
 """Error against the truth that is a reservation: the larger of a length [m] and a share of the path."""
@@ -87,12 +87,13 @@ def judge(files: RunFiles) -> Verdict:
 
 
 def _judge_tracking(case: _Case, frames: FrameTable) -> None:
-    total, tracked = len(frames), int(frames.posed.sum())
+    dropped, tracked = frames.state.count("dropped"), int(frames.posed.sum())
+    total = len(frames) - dropped
     lost, unreadable = frames.state.count("lost"), frames.state.count("unreadable")
     relocalised = frames.state.count("relocalised")
-    readable = [state for state in frames.state if state != "unreadable"]
+    readable = [state for state in frames.state if state not in ("unreadable", "dropped")]
     if readable and readable[-1] == "lost":
-        since = total - 1 - int(np.flatnonzero(frames.posed)[-1]) if tracked else total
+        since = len(frames) - 1 - int(np.flatnonzero(frames.posed)[-1]) if tracked else len(frames)
         case.against.append(f"The camera was lost at the end, for the last {count_of(since, 'frame')}.")
         case.advise("Record on until the camera sees again what it has mapped before: it is found there.")
     if 2 * tracked < total:
@@ -108,10 +109,18 @@ def _judge_tracking(case: _Case, frames: FrameTable) -> None:
         sentence = f"{count_of(unreadable, 'frame')} could not be read; the poses there are interpolated."
         (case.reservations if unreadable > DOUBTFUL_SHARE * total else case.favour).append(sentence)
         case.advise("Copy the recording again, or leave the damaged frames out with --frames.")
+    if dropped:
+        sentence = (
+            f"{count_of(dropped, 'frame')} of {len(frames)} were dropped to keep pace with the recording; the poses "
+            "there are interpolated."
+        )
+        (case.reservations if dropped > DOUBTFUL_SHARE * len(frames) else case.favour).append(sentence)
+        case.advise("Run it without --realtime: every frame is taken then.")
     if tracked == total and not frames.aligned.any():
         case.favour.append("The poses were given: the map was fused there, and nothing was tracked.")
     elif not lost and not unreadable:
-        case.favour.append(f"All {total} frames were aligned with the map, and the camera was never lost.")
+        what = f"All {total} frames" + (" that were not dropped" if dropped else "")
+        case.favour.append(f"{what} were aligned with the map, and the camera was never lost.")
 
 
 def _advice_on_loss(frames: FrameTable) -> list[str]:

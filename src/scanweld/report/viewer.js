@@ -165,8 +165,8 @@ class Viewer {
   pathSegments() {
     const { scene } = this;
     const kinds = report.data.frames.kinds;
-    const names = { t: "tracked", r: "tracked", l: "lost", u: "unreadable", d: "degenerate", m: "degenerate", e: "lost" };
-    const rank = "trmdule";  // of two ends the worse one gives the colour
+    const names = { t: "tracked", r: "tracked", l: "lost", u: "unreadable", s: "unreadable", d: "degenerate", m: "degenerate", e: "lost" };
+    const rank = "trmdsule";  // of two ends the worse one gives the colour
     const found = [];
     const arm = 0.005 * this.diagonal();
     for (const k of scene.keyframes) {
@@ -207,7 +207,7 @@ class Viewer {
     const place = (x, y, z) => [0, 1, 2].map((k) => c[k] + R[3 * k] * x + R[3 * k + 1] * y + R[3 * k + 2] * z);
     const corners = [place(-w, -h, deep), place(w, -h, deep), place(w, h, deep), place(-w, h, deep)];
     const roof = place(0, -1.5 * h, deep);  // which side is up
-    const kinds = { l: LINE.lost, u: LINE.unreadable };
+    const kinds = { l: LINE.lost, u: LINE.unreadable, s: LINE.unreadable };
     const kind = kinds[report.data.frames.kinds[i]] ?? LINE.frustum;
     const edges = corners.flatMap((corner, k) => [[c, corner, kind], [corner, corners[(k + 1) % 4], kind]]);
     return [...edges, [corners[0], roof, kind], [roof, corners[1], kind]];

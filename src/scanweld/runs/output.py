@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 
 from scanweld.arrays import Float64
+from scanweld.backends import get_backend
 from scanweld.config import to_toml
 from scanweld.datasets.base import RgbdSequence
 from scanweld.evaluation.trajectory_metrics import AteResult
@@ -208,4 +209,5 @@ def _environment(config: SlamConfig) -> dict[str, Any]:
         "packages": packages,
         "seed": config.seed,
         "threads": get_num_threads(),
+        "backend": get_backend(),
     }

@@ -17,6 +17,7 @@ from scanweld.arrays import Float32, Float64
 from scanweld.datasets.base import LiveSequence, RgbdSequence
 from scanweld.datasets.gyroscope import gyroscope_of
 from scanweld.datasets.images import check_depth_unit, explain_unusable_depth
+from scanweld.datasets.playback import Clock, WallClock, play
 from scanweld.datasets.stream import stream
 from scanweld.errors import DatasetError, InvalidInputError
 from scanweld.evaluation.surface_metrics import compression_ratio
@@ -31,8 +32,9 @@ from scanweld.runs.observer import RunObserver
 from scanweld.runs.output import write_run
 from scanweld.runs.refining import calibrate as calibrate_camera
 from scanweld.runs.refining import described
-from scanweld.slam.motion import POSED
+from scanweld.slam.motion import POSED, UNSEEN
 from scanweld.slam.system import Slam, SlamConfig, build_slam
+from scanweld.slam.warmup import load_kernels
 from scanweld.trajectory import FrameResult, FrameState, Trajectory
 
 logger = logging.getLogger(__name__)
@@ -70,10 +72,11 @@ class RunSummary:
 
     @property
     def trustworthy(self) -> bool:
-        """Whether tracking held at the end and for at least half of the frames."""
+        """Whether tracking held at the end and for at least half of the frames, without those that were dropped."""
         tracked = sum(result.state in POSED for result in self.results)
-        posed_at_end = [r for r in self.results if r.state is not FrameState.UNREADABLE]
-        return bool(posed_at_end) and posed_at_end[-1].state in POSED and 2 * tracked >= len(self.results)
+        taken = sum(result.state is not FrameState.DROPPED for result in self.results)
+        seen = [result for result in self.results if result.state not in UNSEEN]
+        return bool(seen) and seen[-1].state in POSED and 2 * tracked >= taken
 
     def __repr__(self) -> str:
         m = self.metrics
@@ -87,6 +90,7 @@ class RunSummary:
             ("interrupted", "yes; what was done by then was kept" if self.interrupted else ""),
             ("lost", f"{m['frames_lost']} frames, found again {m['relocalisations']}x" if m["frames_lost"] else ""),
             ("unreadable", f"{m['frames_unreadable']} frames" if m["frames_unreadable"] else ""),
+            ("dropped", f"{m['frames_dropped']} frames, to keep pace" if m.get("frames_dropped") else ""),
             ("path", f"{m['path_length_m']:.2f} m"),
             ("ATE", f"{1e3 * ate_m:.2f} mm" if ate_m is not None else "no ground truth"),
             ("loops", f"{m['loop_closures']} closed" if m["loop_closures"] else ""),
@@ -163,12 +167,13 @@ class _Run:
         why = explain_unusable_depth(self.tally.median_depth_m, self.sequence.depth_scale, usable_m)
         raise DatasetError(f"{self.sequence.name}: no frame has usable depth, the map is empty; {why}")
 
-    def describe(self, description: Mapping[str, Any], *, calibrate: bool) -> dict[str, Any]:
+    def describe(self, description: Mapping[str, Any], *, calibrate: bool, realtime: bool) -> dict[str, Any]:
         """Return a description with what became of the run; `calibrate`: whether that was asked for."""
         return {
             **description,
             "warnings": [*description.get("warnings", ()), *self.tally.warnings],
             "interrupted": self.interrupted,
+            "realtime": realtime,
             **({"calibrated": isinstance(self.sequence, CalibratedSequence)} if calibrate else {}),
             **({"refinements": described(self.refinements)} if self.refinements else {}),
         }
@@ -186,6 +191,8 @@ def run_sequence(
     tracked_only: bool = False,
     calibrate: bool = False,
     refine: bool = False,
+    realtime: bool = False,
+    clock: Clock | None = None,
     description: Mapping[str, Any] | None = None,
     started: float | None = None,
 ) -> RunSummary:
@@ -203,6 +210,10 @@ def run_sequence(
     tracked_only : leave lines of frames without a measured pose out of trajectory.txt
     calibrate : estimate intrinsics and depth from the keyframes, and where that helps run once more with them
     refine : adjust the keyframes in the end; map and trajectory move with them (docs/refinement.md)
+    realtime : play the recording at the speed of its timestamps, and drop frames instead of falling behind
+        (:func:`~.playback.play`); by default every frame is taken, and results do not depend on timing. A live camera
+        is in real time anyway
+    clock : that of `realtime`; by default the machine's
     description : goes into run.json; its "warnings" are put before those of the run
     started : `time.perf_counter()` from which seconds_total counts; default now
 
@@ -213,7 +224,8 @@ def run_sequence(
     DatasetError
         When no frame can be decoded.
     InvalidInputError
-        When no given pose belongs to a frame, or given poses are to be refined.
+        When no given pose belongs to a frame, given poses are to be refined, or a camera is to be calibrated in real
+        time.
     """
     if isinstance(sequence, LiveSequence) and (calibrate or poses is not None):
         raise InvalidInputError(
@@ -221,6 +233,8 @@ def run_sequence(
         )
     if poses is not None and (calibrate or refine):
         raise InvalidInputError("poses: given poses are not refined; leave out either poses, or refine and calibrate")
+    if realtime and calibrate:
+        raise InvalidInputError("calibrate: the recording is run twice for it, which is not real time; leave one out")
     started = time.perf_counter() if started is None else started
     config = config or SlamConfig()
     if out is not None:
@@ -230,7 +244,7 @@ def run_sequence(
         def after_frame(slam: Slam, frame: Frame | None, result: FrameResult) -> None:
             if progress is not None:
                 progress(result)
-            for observer in observers:
+            for observer in observers if result.state is not FrameState.DROPPED else ():
                 observer.on_frame(slam, frame, result)
             patience.check()  # only here: a frame is in the map and in the trajectory, or in neither
             while not all(observer.ready(HELD_S) for observer in observers):
@@ -240,7 +254,10 @@ def run_sequence(
         placed = _beside(config, out)
         run = _Run(sequence, placed, build_slam(sequence.camera, placed))
         try:
-            _process_all(run.slam, sequence, run.tally, given, after_frame)
+            if realtime:
+                load_kernels()
+            played_by = (clock or WallClock()) if realtime else None
+            _process_all(run.slam, sequence, run.tally, given, after_frame, played_by)
             if calibrate:
                 run.calibrate(after_frame)
             if refine:
@@ -258,8 +275,8 @@ def run_sequence(
         if out is not None:
             with write_folder(out, force=force) as aside:
                 write_run(
-                    aside, run.slam, run.sequence, config, metrics, error, tracked_only=tracked_only,
-                    description=run.describe(description or {}, calibrate=calibrate), started=started,
+                    aside, run.slam, run.sequence, config, metrics, error, tracked_only=tracked_only, started=started,
+                    description=run.describe(description or {}, calibrate=calibrate, realtime=realtime),
                 )  # fmt: skip
         results, refinements = tuple(run.slam.main_results), tuple(run.refinements)
         return RunSummary(out, metrics, results, run.slam.map, run.interrupted, refinements)
@@ -274,16 +291,27 @@ def _beside(config: SlamConfig, out: Path | None) -> SlamConfig:
 
 
 def _process_all(
-    slam: Slam, sequence: RgbdSequence, tally: _Tally, given: list[Float64 | None] | None, after_frame: AfterFrame
+    slam: Slam,
+    sequence: RgbdSequence,
+    tally: _Tally,
+    given: list[Float64 | None] | None,
+    after_frame: AfterFrame,
+    clock: Clock | None = None,
 ) -> None:
-    """Walk through a sequence: track each frame, or take its given T_world_camera."""
+    """Walk through a sequence: track each frame, or take its given T_world_camera; with a clock, at its pace."""
     gyroscope = gyroscope_of(sequence)
     turned = None if gyroscope is None else gyroscope.orientations(sequence.timestamps_s)
-    # Two frames ahead: a prepared one of 640x480 holds 20 MB.
-    with contextlib.closing(stream(sequence, 2, prepare=slam.prepare)) as records:
+    if clock is None or isinstance(sequence, LiveSequence):
+        # Two frames ahead: a prepared one of 640x480 holds 20 MB.
+        source = stream(sequence, 2, prepare=slam.prepare)
+    else:
+        source = play(sequence, prepare=slam.prepare, clock=clock)
+    with contextlib.closing(source) as records:
         for record in records:
             pose = given[record.index] if given is not None else None
-            if record.frame is None:
+            if record.dropped:
+                result = slam.drop(record.timestamp_s, record.error)
+            elif record.frame is None:
                 tally.warn(f"frame {record.index} is skipped: {record.error}")
                 result = slam.skip(record.timestamp_s, record.error)
             elif given is not None and pose is None:
@@ -340,6 +368,7 @@ def summarise(slam: Slam, truth: Trajectory | None, num_points_input: int) -> tu
         "frames_tracked": sum(state in POSED for state in states),
         "frames_lost": states.count(FrameState.LOST),
         "frames_unreadable": states.count(FrameState.UNREADABLE),
+        "frames_dropped": states.count(FrameState.DROPPED),
         "relocalisations": states.count(FrameState.RELOCALISED),
         "loop_closures": slam.loop_closer.num_closures,
         "submaps_joined": slam.atlas.num_joins,
