@@ -167,3 +167,33 @@ def point_to_plane_sums(
             gather_surface(count, pixels, target, surface)
             point_to_plane_rows(count, moved, surface, gate, min_cosine, robust, rows, sums)
             accumulate(rows, COLUMNS, count, weighted, sums)
+
+
+@kernel
+def compare_with_depth(positions, normals, transform, target, intrinsics, width, height, counts):
+    """Count (4,) how many points land on a surface, and how many of them are on it, in front of it and behind it.
+
+    positions, normals (3, N) float32 in the source frame; the rest as for `point_to_plane_sums`. What counts as on it
+    says `verification.check_against_depth`.
+    """
+    moved, pixels, surface = np.empty(6 * BLOCK, np.float32), np.empty(BLOCK, np.int32), np.empty(7 * BLOCK, np.float32)
+    counts[:] = 0
+    total = positions.shape[1]
+    for first in range(0, total, BLOCK):
+        count = min(BLOCK, total - first)
+        project_block(first, count, positions, normals, transform, intrinsics, width, height, moved, pixels)
+        gather_surface(count, pixels, target, surface)
+        for k in range(count):
+            s = surface[k + 6 * BLOCK]
+            if s <= 0:
+                continue
+            dx, dy = moved[k] - surface[k], moved[k + BLOCK] - surface[k + BLOCK]
+            dz = moved[k + 2 * BLOCK] - surface[k + 2 * BLOCK]
+            nx, ny, nz = surface[k + 3 * BLOCK], surface[k + 4 * BLOCK], surface[k + 5 * BLOCK]
+            cosine = nx * moved[k + 3 * BLOCK] + ny * moved[k + 4 * BLOCK] + nz * moved[k + 5 * BLOCK]
+            off, far = abs(nx * dx + ny * dy + nz * dz) * s, max(np.float32(0.05), np.float32(6) / s)
+            agrees = (off < np.float32(4)) & (abs(dz) < np.float32(0.1)) & (cosine > np.float32(0.5))
+            counts[0] += 1
+            counts[1] += agrees
+            counts[2] += (not agrees) & (dz < -far)
+            counts[3] += (not agrees) & (dz > far)

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 
@@ -22,6 +23,7 @@ from scanweld.geometry.depth import SurfaceLevel, SurfacePyramid, as_kernel_inpu
 from scanweld.geometry.views import ModelView
 from scanweld.parallel import run_ranges
 from scanweld.registration.result import RegistrationResult, Status
+from scanweld.state import Stateful
 from scanweld.tracking import kernels
 
 
@@ -75,8 +77,11 @@ class _EmptySpace:
     empty_until_m: Float32
 
 
-class MotionDetector:
+class MotionDetector(Stateful):
     """Finds what moves in the frames of a sequence, in front of what the map and the last views have seen."""
+
+    STATE: ClassVar = {"_memory": deque[_EmptySpace], "_frames": int}
+    MADE = frozenset({"config"})
 
     def __init__(self, config: DynamicsConfig | None = None) -> None:
         self.config = config or DynamicsConfig()

@@ -14,14 +14,15 @@ CLOSED, OPEN, SEED = np.uint8(0), np.uint8(1), np.uint8(2)
 
 
 @kernel
-def list_rows(index_map, confidences, least, rows):
+def list_rows(index_map, confidences, least, stride, rows):
     """List the rows of a view in the order of its pixels, those of at least this confidence; returns how many.
 
-    index_map (H, W) int32, confidences (N,) float32: see `ModelView`; rows (H * W + 1,) int64.
+    index_map (H, W) int32, confidences (N,) float32: see `ModelView`; stride: of the pixels that are looked at, along
+    rows, each a pixel aside of the one above; rows (H * W + 1,) int64.
     """
     count = 0
     for v in range(index_map.shape[0]):
-        for u in range(index_map.shape[1]):
+        for u in range((stride - v % stride) % stride, index_map.shape[1], stride):
             row = index_map[v, u]
             rows[count] = row  # written always, counted only when listed: no branch to mispredict
             count += 1 if (row >= 0) & (confidences[np.uint64(max(row, np.int32(0)))] >= least) else 0

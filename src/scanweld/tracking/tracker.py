@@ -143,18 +143,20 @@ class FrameToModelTracker:
         new to this place has nothing better than all of them.
         """
         config = self.config
-        rows = _listed(view, view.stable_confidence)
-        if len(rows) < MIN_STABLE_SHARE * len(view):
-            rows = _listed(view, -np.inf)
-        wanted = max(round(config.stable_fraction * len(rows)), config.projective.min_points)
-        if wanted < len(rows):
-            # Confidence stops growing, so ties are the rule: those at the limit are taken evenly over the image.
-            confidences = view.confidences[rows]
-            limit = np.partition(confidences, len(rows) - wanted)[len(rows) - wanted]
-            above, tied = np.flatnonzero(confidences > limit), np.flatnonzero(confidences == limit)
-            more = wanted - len(above)
-            rows = rows[np.sort(np.concatenate([above, tied[np.arange(more) * len(tied) // more]]))]
-        return rows[:: max(1, -(-len(rows) // config.projective.max_points))]
+        least, count = view.stable_confidence, int(np.count_nonzero(view.confidences >= view.stable_confidence))
+        if count < MIN_STABLE_SHARE * len(view):
+            least, count = -np.inf, len(view)
+        wanted = max(round(config.stable_fraction * count), config.projective.min_points)
+        if wanted >= count:
+            return _listed(view, least, -(-count // config.projective.max_points))
+        rows = _listed(view, least)
+        # Confidence stops growing, so ties are the rule: those at the limit are taken evenly over the image.
+        confidences = view.confidences[rows]
+        limit = np.partition(confidences, count - wanted)[count - wanted]
+        above, tied = np.flatnonzero(confidences > limit), np.flatnonzero(confidences == limit)
+        more = wanted - len(above)
+        rows = rows[np.sort(np.concatenate([above, tied[np.arange(more) * len(tied) // more]]))]
+        return rows[:: max(1, -(-wanted // config.projective.max_points))]
 
     def _photometry(self, pyramid: SurfacePyramid, view: ModelView, rows: Int64) -> Photometry | None:
         """Return the brightness of both sides where there is any and it is wanted."""
@@ -163,12 +165,12 @@ class FrameToModelTracker:
         return Photometry(view.intensities[rows], pyramid.grey, view, rows)
 
 
-def _listed(view: ModelView, least: float) -> Int64:
-    """List the rows (M,) of at least this confidence in the order of the image."""
+def _listed(view: ModelView, least: float, stride: int = 1) -> Int64:
+    """List the rows (M,) of at least this confidence at every `stride`-th pixel, in the order of the image."""
     if len(view) == 0:
         return np.empty(0, np.int64)
     rows = np.empty(view.index_map.size + 1, np.int64)
-    return rows[: kernels.list_rows(view.index_map, view.confidences, np.float32(least), rows)]
+    return rows[: kernels.list_rows(view.index_map, view.confidences, np.float32(least), max(1, stride), rows)]
 
 
 @dataclass(frozen=True, slots=True)
