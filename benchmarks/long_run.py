@@ -1,9 +1,9 @@
 """A walk of thousands of frames round and round a corridor, with the noise of a Kinect: does a frame's cost stay flat?
 
-    python benchmarks/long_run.py [--frames 5200] [--size 640x480] [--budget-mb 300] [--folder FOLDER] [--json]
+    python benchmarks/long_run.py [--frames 5200] [--size 640x480] [--budget-mb 300] [--lap SEQUENCE] [--json]
 
-The frames are rendered into FOLDER first, 0.6 MB each at 640x480, unless they are there from an earlier time; a round
-of 34 m takes 1 570 frames, and the noise of each is its own. They are then decoded and processed as `scanweld slam`
+One round of 37 m, some 1 570 frames of 0.6 MB at 640x480, is rendered first unless SEQUENCE is there; the walk is that
+round again and again, noise included. The frames are then decoded and processed as `scanweld slam`
 does, the next frames on a thread beside. Given are frames a second from first to last; ms a frame, waiting for the
 decoder included, for the frames from 500 to 1000 and the last 500, and the ratio of these; surfels, and memory against
 the budget; the error of the path.
@@ -17,11 +17,16 @@ import json
 import statistics
 import tempfile
 import time
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 import scanweld as sw
 from big_map import peak_mb, resident_mb
+from scanweld.arrays import Float64
+from scanweld.datasets.base import WrappedSequence
 from scanweld.datasets.stream import stream
 from scanweld.mapping.storage.pages import MapConfig
 from scanweld.slam.warmup import compile_kernels
@@ -35,31 +40,51 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=5200)
     parser.add_argument("--size", default="640x480")
     parser.add_argument("--budget-mb", type=float, default=300.0)
-    parser.add_argument("--folder", type=Path, default=Path(tempfile.gettempdir()) / "scanweld-long-run")
+    parser.add_argument("--lap", type=Path, help="rendered here if it is not there")
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
-    folder = rendered(arguments.folder, arguments.size, arguments.frames)
-    figures = run(
-        folder, arguments.frames, MapConfig(memory_budget_mb=arguments.budget_mb, folder=str(arguments.folder))
-    )
+    lap = arguments.lap or Path(tempfile.gettempdir()) / f"scanweld-lap-{arguments.size}"
+    if not lap.exists():
+        width, height = (int(number) for number in arguments.size.split("x"))
+        sw.render_sequence(lap, sw.RenderConfig(scene="corridor", noise="kinect", width=width, height=height))
+    storage = MapConfig(memory_budget_mb=arguments.budget_mb, folder=str(lap.parent))
+    figures = run(Laps(sw.open_sequence(lap), arguments.frames), storage)
     print(json.dumps(figures, indent=1) if arguments.json else text(figures))
 
 
-def rendered(folder: Path, size: str, frames: int) -> Path:
-    """Return the folder of a rendered sequence, which is rendered when it is not there."""
-    sequence = folder / f"corridor-{size}-{frames}"
-    if not sequence.exists():
-        folder.mkdir(parents=True, exist_ok=True)
-        width, height = (int(number) for number in size.split("x"))
-        config = sw.RenderConfig(scene="corridor", noise="kinect", frames=frames, width=width, height=height)
-        sw.render_sequence(sequence, config)
-    return sequence
+@dataclass(frozen=True, slots=True)
+class Laps(WrappedSequence):
+    """A sequence that ends where it begins, again and again, for `count` frames."""
+
+    count: int
+
+    @property
+    def timestamps_s(self) -> Float64:
+        """Time of every frame: each lap begins one frame after the one before."""
+        times = self.base.timestamps_s
+        period = times[-1] - times[0] + np.median(np.diff(times))
+        laps, frames = np.divmod(np.arange(self.count), len(times))
+        return np.asarray(times[frames] + laps * period)
+
+    @property
+    def ground_truth(self) -> sw.Trajectory:
+        """The same poses in every lap."""
+        truth = self.base.ground_truth
+        assert truth is not None
+        return sw.Trajectory(self.timestamps_s, truth.T_world_camera[np.arange(self.count) % len(self.base)])
+
+    def __len__(self) -> int:
+        return self.count
+
+    def read(self, index: int) -> sw.Frame:
+        """Decode a frame; its time is that of its lap."""
+        return replace(self.base.read(index % len(self.base)), timestamp_s=float(self.timestamps_s[index]))
 
 
-def run(folder: Path, frames: int, storage: MapConfig) -> dict[str, Any]:
+def run(sequence: Laps, storage: MapConfig) -> dict[str, Any]:
     """Process every frame and measure."""
     compile_kernels(lambda _: None)
-    sequence = sw.open_sequence(folder)
+    frames = len(sequence)
     slam = sw.build_slam(sequence.camera, sw.SlamConfig(map=storage))
     times_s, now = [], time.perf_counter()
     with contextlib.closing(stream(sequence, 2, prepare=slam.prepare)) as records:
@@ -70,7 +95,6 @@ def run(folder: Path, frames: int, storage: MapConfig) -> dict[str, Any]:
             now += times_s[-1]
     window = min(WINDOW, frames // 4)  # of a short run, too
     early, late = times_s[window : 2 * window], times_s[-window:]
-    assert sequence.ground_truth is not None
     keyframes = slam.loop_closer.database.keyframes  # type: ignore[attr-defined]
     return {
         "frames": len(times_s),
