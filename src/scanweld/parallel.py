@@ -62,7 +62,12 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # spinning OpenMP workers o
 import numba  # noqa: E402  (the two variables above must be set before it loads)
 
 # error_model "numpy": a division by zero gives inf, not a branch. Kernels test masks, never NaN (fast-math).
-kernel: Callable[[Any], Any] = numba.njit(fastmath=True, error_model="numpy", boundscheck=False, cache=True, nogil=True)
+# forceinline: a kernel that another one calls would be in both of their object files, optimised once in its own and
+# twice in the caller's, and the linker keeps the first that it meets: its own in the process that compiles, the
+# caller's in those that load from the cache. They round differently.
+kernel: Callable[[Any], Any] = numba.njit(
+    fastmath=True, error_model="numpy", boundscheck=False, cache=True, nogil=True, forceinline=True
+)
 """Decorator of every compiled kernel."""
 
 inlined: Callable[[Any], Any] = numba.njit(
@@ -114,9 +119,8 @@ def set_num_threads(count: int) -> None:
     global _num_threads, _pool
     if count < 1:
         raise InvalidInputError(f"threads: expected at least one thread, got {count}")
-    if _pool is not None and count != _num_threads:
-        _pool.shutdown(wait=True)
-        _pool = None
+    # The pool is not shut down: a background thread may be about to use it. Its threads end when nobody holds it.
+    _pool = _pool if count == _num_threads else None
     _num_threads = count
 
 
@@ -141,19 +145,25 @@ def run_ranges(count: int, body: Callable[[int, int], object], *, grain: int = 1
     if len(ranges) == 1 or getattr(_inside, "pool", False):  # a worker that waited for workers could wait for ever
         body(0, count)
         return
-    if _pool is None:
-        _pool = ThreadPoolExecutor(
+    pool = _pool
+    if pool is None:
+        pool = _pool = ThreadPoolExecutor(
             max_workers=max(_num_threads - 1, 1), thread_name_prefix="scanweld", initializer=_enter_pool
         )
-    futures: list[Future[object]] = [_pool.submit(body, start, stop) for start, stop in ranges[1:]]
+    futures: list[Future[object]] = [pool.submit(body, start, stop) for start, stop in ranges[1:]]
     try:
         _inside.pool = True  # the workers are busy: what the body itself would share out, it does alone
         body(*ranges[0])
+        for future, (start, stop) in zip(futures, ranges[1:], strict=True):
+            if future.cancel():  # no worker has come to it yet: nobody waits for one
+                body(start, stop)
     finally:
         _inside.pool = False
-        wait(futures)  # nobody writes into the caller's arrays once it goes on
+        # Nobody writes into the caller's arrays once it goes on. (What was cancelled has ended only for a worker.)
+        wait([future for future in futures if not future.cancelled()])
     for future in futures:
-        future.result()
+        if not future.cancelled():
+            future.result()
 
 
 def in_background(call: Callable[[], _One]) -> Future[_One]:
@@ -168,13 +178,18 @@ def _enter_pool() -> None:
     _inside.pool = True
 
 
+def _finish_background() -> None:
+    if _background is not None:
+        _background.submit(lambda: None).result()  # calls take turns: those before it have ended
+
+
 def _forget_pool() -> None:
     global _pool, _background
     _pool = _background = None
 
 
 if hasattr(os, "register_at_fork"):  # threads do not survive a fork: a child would wait for its parent's
-    os.register_at_fork(after_in_child=_forget_pool)
+    os.register_at_fork(before=_finish_background, after_in_child=_forget_pool)
 
 
 def side_by_side(one: Callable[[], _One], other: Callable[[], _Other]) -> tuple[_One, _Other]:

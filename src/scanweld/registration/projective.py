@@ -6,6 +6,7 @@ solved by Gauss-Newton with Huber weights on residuals in units of the depth noi
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -301,8 +302,7 @@ def _descend(
             end.parts = spectrum(step.equations, held=held)
             end.xi = solve(step.equations, end.parts)
             end.T_target_source = se3.exp(end.xi) @ end.T_target_source
-            turn = float(np.linalg.norm(end.xi[3:]))
-            motion = float(np.linalg.norm(end.xi[:3] + np.cross(end.xi[3:], end.centroid_m))) + end.radius_m * turn
+            motion = _largest_shift(end.xi, end.centroid_m, end.radius_m)
             # On the finest level a step within half a standard deviation of the estimate is noise. A coarse level need
             # only hand over a start within its pixel size.
             deviation = standard_deviation(step.equations, end.parts) if level == 0 else 0.0
@@ -310,6 +310,14 @@ def _descend(
                 end.converged = True
                 break
     return end
+
+
+def _largest_shift(xi: Float64, centroid_m: Float64, radius_m: float) -> float:
+    """Return how far a small step moves points around a centroid at most: its shift, and its turn at their radius."""
+    x, y, z, a, b, c = xi.tolist()
+    u, v, w = centroid_m.tolist()
+    shift = math.hypot(x + b * w - c * v, y + c * u - a * w, z + a * v - b * u)
+    return shift + radius_m * math.hypot(a, b, c)
 
 
 def _stages(count: int, coarsest: int, config: ProjectiveConfig) -> Iterator[tuple[int, int]]:

@@ -147,16 +147,23 @@ class PhotometricRows:
     points_m: Float64
 
 
-def reference_rows(
-    points: LitPoints,
-    target: LitTarget,
-    T_target_source: Float64,
-    brightness: Brightness,
-    gate_m: float,
-    min_cosine: float,
-) -> PhotometricRows:
-    """Compute in NumPy what the kernel `photometric_rows` computes, in double precision and without weights."""
-    camera, grey = target.surface.camera, target.grey.astype(np.float64)
+@dataclass(frozen=True, slots=True)
+class Sightings:
+    """What a frame shows of points: `seen` (N,) says which M count; points_m (M, 3), target frame; model, frame (M,)
+    intensities; slopes (2, M), across and down [grey levels per pixel]."""
+
+    seen: Bool
+    points_m: Float64
+    model: Float64
+    frame: Float64
+    slopes: Float64
+
+
+def sightings(
+    points: LitPoints, target: LitTarget, T_target_source: Float64, gate_m: float, min_cosine: float
+) -> Sightings:
+    """Look up the brightness of points in the frame, in NumPy and in double precision; for few points and for tests."""
+    camera, grey = target.surface.camera, target.grey
     R, t = T_target_source[:3, :3], T_target_source[:3, 3]
     p = points.positions_m.T.astype(np.float64) @ R.T + t
     n = points.normals.T.astype(np.float64) @ R.T
@@ -169,15 +176,30 @@ def reference_rows(
     p, u, v, model = p[seen], u[seen], v[seen], points.intensities[seen].astype(np.float64)
     column, row = np.floor(u).astype(np.int64), np.floor(v).astype(np.int64)
     e, f = u - column, v - row
-    corners = [[grey[row + j, column + i] for i in (0, 1)] for j in (0, 1)]
+    corners = [[grey[row + j, column + i].astype(np.float64) for i in (0, 1)] for j in (0, 1)]
     frame = (1 - f) * ((1 - e) * corners[0][0] + e * corners[0][1]) + f * ((1 - e) * corners[1][0] + e * corners[1][1])
     slope_u = (1 - f) * (corners[0][1] - corners[0][0]) + f * (corners[1][1] - corners[1][0])
     slope_v = (1 - e) * (corners[1][0] - corners[0][0]) + e * (corners[1][1] - corners[0][1])
+    return Sightings(seen, p, model, frame, np.stack([slope_u, slope_v]))
+
+
+def reference_rows(
+    points: LitPoints,
+    target: LitTarget,
+    T_target_source: Float64,
+    brightness: Brightness,
+    gate_m: float,
+    min_cosine: float,
+) -> PhotometricRows:
+    """Compute in NumPy what the kernel `photometric_rows` computes, in double precision and without weights."""
+    at = sightings(points, target, T_target_source, gate_m, min_cosine)
+    camera, p, (slope_u, slope_v) = target.surface.camera, at.points_m, at.slopes
     d = np.zeros_like(p)
     d[:, 0], d[:, 1] = -slope_u * camera.fx / p[:, 2], -slope_v * camera.fy / p[:, 2]
     d[:, 2] = -(d[:, 0] * p[:, 0] + d[:, 1] * p[:, 1]) / p[:, 2]
-    jacobian = np.concatenate([d, np.cross(p, d), model[:, None], np.ones((len(p), 1))], axis=1)
-    return PhotometricRows(jacobian, brightness.gain * model + brightness.offset - frame, seen, model, frame, p)
+    jacobian = np.concatenate([d, np.cross(p, d), at.model[:, None], np.ones((len(p), 1))], axis=1)
+    residuals = brightness.gain * at.model + brightness.offset - at.frame
+    return PhotometricRows(jacobian, residuals, at.seen, at.model, at.frame, p)
 
 
 def estimate_brightness(
@@ -188,8 +210,8 @@ def estimate_brightness(
     Robust regression with Student's t and the median absolute deviation as the scale; None where too little is seen.
     """
     few = points.every(max(1, len(points) // SCALE_SAMPLES))
-    rows = reference_rows(few, target, T_target_source, Brightness(), gate_m, min_cosine)
-    model, frame = rows.model, rows.frame
+    at = sightings(few, target, T_target_source, gate_m, min_cosine)
+    model, frame = at.model, at.frame
     if len(model) < MIN_SAMPLES:
         return None
     gain, offset = 1.0, _median(frame - model)
