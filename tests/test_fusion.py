@@ -1,4 +1,4 @@
-"""Point-based fusion against plain NumPy and the equations of Keller et al. 2013."""
+"""Point-based fusion against the equations of Keller et al. 2013; against plain NumPy it is in test_backends."""
 
 from __future__ import annotations
 
@@ -13,9 +13,7 @@ from scipy.spatial import cKDTree
 import scanweld as sw
 from rendered import CAMERA, frame_of, plane_depth, rendered
 from scanweld.geometry import se3
-from scanweld.geometry.depth import SurfacePyramid
 from scanweld.mapping.fusion import FusionConfig, radial_weight, tidy
-from scanweld.mapping.rendering import find_candidates, render_index_map
 
 SMALL = sw.PinholeCamera(40.0, 41.0, 19.3, 14.8, 40, 30)
 ALL = ("positions_m", "normals", "colors", "radii_m", "confidences", "created", "last_seen", "anchors")
@@ -75,116 +73,6 @@ class TestWeight:
         for v, u in ((0, 0), (251, 300), (100, 500), (479, 639)):
             gamma = np.hypot(u - 300.3, v - 250.7) / corner
             assert weight[v, u] == pytest.approx(np.exp(-(gamma**2) / (2 * 0.36)), rel=1e-6)
-
-
-def reference_fuse(
-    surfels: sw.SurfelMap, pyramid: SurfacePyramid, T: np.ndarray, config: FusionConfig, frame_id: int
-) -> dict[str, np.ndarray]:
-    """One pixel at a time: what the map holds after a frame."""
-    level, camera = pyramid.levels[0], pyramid.frame.camera
-    surface, alpha = level.surface.astype(np.float64), radial_weight(camera).astype(np.float64)
-    seen = render_index_map(surfels, find_candidates(surfels, T, camera), T, camera, config.stable_confidence)
-    index_map = np.where(seen.numbers >= 0, surfels.rows_of(np.maximum(seen.numbers, 0)), -1)
-    old = values_of(surfels)
-    new = {name: values.copy() for name, values in old.items()}
-    appended: dict[str, list[object]] = {name: [] for name in ALL}
-    R, t, unmatched = T[:3, :3], T[:3, 3], []
-    for v, u in np.ndindex(*camera.shape):
-        row, i, color = surface[v, u], index_map[v, u], pyramid.frame.color[v, u].astype(float)
-        if row[6] == 0:
-            continue
-        q, n, weight = R @ row[:3] + t, R @ row[3:6], alpha[v, u]
-        gate = max(config.gate_sigma / row[6], config.gate_floor_m)
-
-        def agrees(
-            surfels: dict[str, np.ndarray], j: int, q: np.ndarray = q, n: np.ndarray = n, gate: float = gate,
-            radius: float = row[7],
-        ) -> bool:  # fmt: skip
-            offset = surfels["positions_m"][:, j] - q
-            facing = n @ surfels["normals"][:, j] > config.min_cosine
-            return abs(n @ offset) < gate and facing and np.linalg.norm(offset) < 4 * radius + gate
-
-        if i >= 0 and agrees(old, i):
-            w = old["confidences"][i]
-            new["positions_m"][:, i] = (w * old["positions_m"][:, i] + weight * q) / (w + weight)
-            new["colors"][:, i] = (w * old["colors"][:, i] + weight * color) / (w + weight)
-            normal = (w * old["normals"][:, i] + weight * n) / (w + weight)
-            new["normals"][:, i] = normal / np.linalg.norm(normal)
-            new["radii_m"][i] = min(old["radii_m"][i], 2 * row[7])
-            new["confidences"][i] = min(w + weight, config.max_confidence)
-            new["last_seen"][i] = frame_id
-            continue
-        unmatched.append((v, u, agrees))
-        if i >= 0 and 0 < v < camera.height - 1 and 0 < u < camera.width - 1:
-            depth = (R.T @ (old["positions_m"][:, i] - t))[2]
-            if depth < surface[v - 1 : v + 2, u - 1 : u + 2, 2].min() - max(config.free_space_margin_m, 2 * gate):
-                new["confidences"][i] = max(old["confidences"][i] - weight, 0)
-    for v, u, agrees in unmatched:  # covered by what the others have become
-        row, i, color = surface[v, u], index_map[v, u], pyramid.frame.color[v, u].astype(float)
-        q, n, weight, covered = R @ row[:3] + t, R @ row[3:6], alpha[v, u], False
-        for y in range(max(0, v - 1), min(camera.height, v + 2)):
-            for x in range(max(0, u - 1), min(camera.width, u + 2)):
-                j = index_map[y, x]
-                if j >= 0 and j != i:
-                    c = R.T @ (new["positions_m"][:, j] - t)
-                    away = np.hypot(camera.fx * c[0] / c[2] + camera.cx - u, camera.fy * c[1] / c[2] + camera.cy - v)
-                    covered |= away < config.spread_pixels and agrees(new, j)
-        if not covered:
-            values = (q, n, color, row[7], weight, frame_id, frame_id, 0)
-            for name, value in zip(ALL, values, strict=True):
-                appended[name].append(value)
-    return {
-        name: np.concatenate([new[name], np.array(appended[name]).T.reshape(*new[name].shape[:-1], -1)], axis=-1)
-        for name in ALL
-    }
-
-
-class TestAgainstNumpy:
-    @pytest.mark.parametrize("seed", range(4))
-    def test_frame_into_a_random_map(self, seed: int) -> None:
-        """A map of a slanted wall, scattered surfels before and behind it, and a frame from a little aside."""
-        rng = np.random.default_rng(seed)
-        config = FusionConfig(unstable_frames=1000, clean_interval=1000, max_confidence=3.0)
-        mapper = sw.SurfelMapper(config)
-        for k in range(2):
-            depth = plane_depth((0.2, 0.1, 1), 1.5, SMALL) + 0.004 * rng.standard_normal(SMALL.shape)
-            frame = frame_of(depth, camera=SMALL)
-            color = rng.integers(0, 256, (*SMALL.shape, 3)).astype(np.uint8)
-            pyramid = sw.build_pyramid(replace(frame, color=color))
-            mapper.fuse(pyramid, se3.exp([0.01 * k, 0, 0, 0, 0.01 * k, 0]))
-        count = 150
-        points = SMALL.rays().reshape(-1, 3)[rng.integers(0, 1200, count)] * rng.uniform(0.9, 2.2, (count, 1))
-        mapper.map.append(
-            points.T.astype(np.float32), np.tile(np.array([[0], [0], [-1]], np.float32), count),
-            rng.integers(0, 256, (3, count)), np.full(count, 0.01, np.float32),
-            rng.uniform(0.1, 2, count).astype(np.float32), 1,
-        )  # fmt: skip
-        depth = plane_depth((0.2, 0.1, 1), 1.5, SMALL) + 0.004 * rng.standard_normal(SMALL.shape)
-        depth[10:14, 20:30] = 0
-        color = rng.integers(0, 256, (*SMALL.shape, 3)).astype(np.uint8)
-        pyramid = sw.build_pyramid(replace(frame_of(depth, camera=SMALL), color=color))
-        T = se3.exp([0.02, -0.01, 0.01, 0.01, 0.02, -0.01])
-        expected = reference_fuse(mapper.map, pyramid, T, config, 2)
-        before, confidences = len(mapper.map), mapper.map.confidences.copy()
-        counts = mapper.fuse(pyramid, T)
-        assert len(mapper.map) == expected["radii_m"].shape[0]
-        assert counts.appended == len(mapper.map) - before > 20
-        changed = expected["confidences"][:before] - confidences
-        assert (changed > 0).sum() > 100
-        assert (changed < 0).sum() > 3
-        for name, values in matched(values_of(mapper.map), expected).items():
-            np.testing.assert_allclose(values, expected[name], atol=1e-3 if name == "colors" else 2e-5, err_msg=name)
-
-    def test_rendered_frames_in_turn(self) -> None:
-        sequence, config = rendered(noise="kinect", count=40), FusionConfig()
-        mapper = sw.SurfelMapper(config)
-        for k, pose in enumerate(sequence.ground_truth.T_world_camera[:3]):
-            pyramid = sw.build_pyramid(sequence.frames[k])
-            expected = reference_fuse(mapper.map, pyramid, pose, config, k)
-            mapper.fuse(pyramid, pose)
-            # A pixel or two sit on the edge of a gate in float32.
-            assert len(mapper.map) == pytest.approx(expected["radii_m"].shape[0], abs=4)
-        assert 10_000 < len(mapper.map) < 40_000
 
 
 class TestMerging:

@@ -1,4 +1,4 @@
-"""The map seen from a pose, against a plain NumPy z-buffer, and pictures of discs whose outline is known."""
+"""The map seen from a pose, and pictures of discs whose outline is known; a plain z-buffer is in test_backends."""
 
 from __future__ import annotations
 
@@ -42,28 +42,6 @@ def index_map_of(surfels: sw.SurfelMap, T_world_camera: np.ndarray, stable: floa
     candidates = find_candidates(surfels, T_world_camera, SMALL)
     seen = render_index_map(surfels, candidates, T_world_camera, SMALL, stable)
     return np.where(seen.numbers >= 0, surfels.rows_of(np.maximum(seen.numbers, 0)), -1)
-
-
-def reference_index_map(surfels: sw.SurfelMap, T_world_camera: np.ndarray, stable: float) -> np.ndarray:
-    """Nearest surfel of each pixel, facing the camera to a cosine of 0.1; doubtful ones count as 2 % further."""
-    p, n, u, v = seen_from(surfels, T_world_camera)
-    index_map, buffer = np.full(SMALL.shape, -1), np.full(SMALL.shape, np.inf)
-    for i in range(len(surfels)):
-        cosine = -(n[:, i] @ p[:, i]) / np.linalg.norm(p[:, i])
-        if p[2, i] <= 0.01 or cosine < 0.1:
-            continue
-        depth = p[2, i] * (1.02 if surfels.confidences[i] < stable else 1.0)
-        row, column = int(np.floor(v[i] + 0.5)), int(np.floor(u[i] + 0.5))
-        if 0 <= row < SMALL.height and 0 <= column < SMALL.width and depth < buffer[row, column]:
-            index_map[row, column], buffer[row, column] = i, depth
-    return index_map
-
-
-@pytest.mark.parametrize("stable", [0.0, 0.5])
-@pytest.mark.parametrize("count", [0, 1, 5000, 12_000])
-def test_index_map_matches_a_numpy_z_buffer(count: int, stable: float) -> None:
-    surfels = cloud(1, count)
-    np.testing.assert_array_equal(index_map_of(surfels, POSE, stable), reference_index_map(surfels, POSE, stable))
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -62,10 +62,9 @@ class TestTracker:
         view, pyramid = mapper.view(guess, CAMERA), sw.build_pyramid(sequence.frames[5])
         tracker = sw.FrameToModelTracker(sw.TrackingConfig(photometry="off"))
         tracked = tracker.track(pyramid, view, guess)
-        rows = tracker._select(view)
-        aligned = align_projective(
-            view.positions_m[:, rows], view.normals[:, rows], pyramid.levels, se3.inverse(guess), tracker.config.projective
-        )
+        positions_m, normals = (side[:, tracker._select(view)] for side in (view.positions_m, view.normals))
+        config = tracker.config.projective
+        aligned = align_projective(positions_m, normals, pyramid.levels, se3.inverse(guess), config)
         T_wc, T_cw = tracked.T_target_source, aligned.T_target_source
         np.testing.assert_allclose(T_wc @ T_cw, np.eye(4), atol=1e-12)
         for eta in 1e-4 * np.eye(6):

@@ -46,6 +46,8 @@ def _coefficients(phi: Float64) -> tuple[Float64 | float, Float64 | float, Float
 
 def _coefficients_of_one(x: float, y: float, z: float) -> tuple[float, float, float]:
     t = math.sqrt(x * x + y * y + z * z)
+    if not t < 1e100:  # where `math` would raise
+        return math.nan, math.nan, math.nan
     c = 1 / 6 - t**2 / 120 + t**4 / 5040 if t < 0.02 else (t - math.sin(t)) / t**3
     if t < _SMALL:
         return 1 - t**2 / 6, 0.5 - t**2 / 24, c
@@ -63,10 +65,10 @@ def exp_so3(phi: npt.ArrayLike) -> Float64:
 def log_so3(rotation: npt.ArrayLike) -> Float64:
     """Return the rotation vectors (..., 3) [rad], angle in [0, pi], of rotations (..., 3, 3)."""
     if np.ndim(rotation) == 2:
-        *vector, w = _quaternion_of_one(np.asarray(rotation, dtype=np.float64).tolist())
-        sine = math.hypot(*vector)
-        factor = 2 + sine**2 / 3 if sine < _SMALL else 2 * math.atan2(sine, w) / sine
-        return factor * np.array(vector)
+        x, y, z, real = _quaternion_of_one(np.asarray(rotation, dtype=np.float64).tolist())
+        length = math.hypot(x, y, z)
+        scale = 2 + length**2 / 3 if length < _SMALL else 2 * math.atan2(length, real) / length
+        return scale * np.array([x, y, z])
     q = quaternion_xyzw_from_rotation(rotation)
     vector, w = q[..., :3], q[..., 3:]
     sine = np.linalg.norm(vector, axis=-1, keepdims=True)

@@ -156,7 +156,7 @@ class FrameToModelTracker:
         above, tied = np.flatnonzero(confidences > limit), np.flatnonzero(confidences == limit)
         more = wanted - len(above)
         rows = rows[np.sort(np.concatenate([above, tied[np.arange(more) * len(tied) // more]]))]
-        return rows[:: max(1, -(-wanted // config.projective.max_points))]
+        return np.asarray(rows[:: max(1, -(-wanted // config.projective.max_points))])
 
     def _photometry(self, pyramid: SurfacePyramid, view: ModelView, rows: Int64) -> Photometry | None:
         """Return the brightness of both sides where there is any and it is wanted."""
