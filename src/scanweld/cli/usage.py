@@ -10,6 +10,9 @@ WORDS = {
     "int_parsing": "expected a whole number",
     "float_parsing": "expected a number",
     "greater_than_equal": "expected {ge:g} or more",
+    "greater_than": "expected more than {gt:g}",
+    "less_than_equal": "expected {le:g} or less",
+    "less_than": "expected less than {lt:g}",
 }
 """What the kinds of errors of Pydantic mean, by which Typer checks values."""
 
