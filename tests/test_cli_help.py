@@ -127,7 +127,10 @@ def test_a_wrong_value_is_named(arguments: list[str], named: list[str]) -> None:
         ({"type": "int_parsing", "input": "many", "msg": "?"}, "expected a whole number, got 'many'"),
         ({"type": "float_parsing", "input": "half", "msg": "?"}, "expected a number, got 'half'"),
         ({"type": "greater_than_equal", "input": -1.5, "ctx": {"ge": 2}, "msg": "?"}, "expected 2 or more, got '-1.5'"),
-        ({"type": "less_than_equal", "input": 70000, "ctx": {"le": 65535}, "msg": "?"}, "expected 65535 or less, got '70000'"),
+        (
+            {"type": "less_than_equal", "input": 70000, "ctx": {"le": 65535}, "msg": "?"},
+            "expected 65535 or less, got '70000'",
+        ),
         ({"type": "value_error", "input": "x", "msg": "Value error, 'x' is not one of 'a', 'b'"}, "'x' is not one of"),
     ],
 )
