@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -67,3 +68,31 @@ def test_reading_ahead_does_not_change_the_answer() -> None:
             slam.process(record.frame)
         answers.add(slam.trajectory.T_world_camera.tobytes() + np.array(slam.map.positions_m).tobytes())
     assert len(answers) == 1
+
+
+SURFACES = """
+import hashlib
+import numpy as np
+from scanweld.geometry import kernels
+from scanweld.geometry.camera import PinholeCamera
+from scanweld.geometry.depth import build_pyramid
+from scanweld.geometry.frame import Frame
+camera = PinholeCamera(120.0, 120.0, 79.5, 59.5, 160, 120)
+v, u = np.mgrid[:120, :160]
+depth = (1 + 0.003 * u + 0.001 * v + 0.01 * np.random.default_rng(0).random(camera.shape)).astype(np.float32)
+surface = build_pyramid(Frame(0.0, depth, None, camera)).levels[0].surface
+print(hashlib.sha256(surface.tobytes()).hexdigest(), sum(kernels.surface_rows.stats.cache_hits.values()))
+"""
+
+
+def test_same_bytes_whether_kernels_are_compiled_or_come_from_the_cache(tmp_path: Path) -> None:
+    """Normals take several kernels that call each other: in one object file each they are optimised differently."""
+    answers = []
+    for _ in range(2):
+        environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+        done = subprocess.run(
+            [sys.executable, "-c", SURFACES], capture_output=True, text=True, timeout=300, check=True, env=environment
+        )
+        answers.append(done.stdout.split())
+    assert [loaded for _, loaded in answers] == ["0", "1"]
+    assert answers[0][0] == answers[1][0]

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import logging
+import os
 from pathlib import Path
 
 import hypothesis.strategies as st
@@ -126,6 +128,38 @@ class TestMappedFile:
         assert len(surfels) == 500
         assert not surfels.pages._backing.paged
         assert caplog.text.count("the map stays in memory") == 1
+
+    def test_a_disk_that_is_full_loses_nothing_and_gets_its_room_back(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        backing = MappedFile(str(tmp_path))
+        first = backing.grow(np.empty(0, np.float32), 5000)
+        first[:] = np.arange(5000)
+        file = backing._file
+        monkeypatch.setattr(backing, "_mapped", raising(OSError(28, "No space left on device")))
+        second = backing.grow(first, 20_000)
+        np.testing.assert_array_equal(second[:5000], np.arange(5000))
+        second[0] = -1
+        assert first[0] == 0
+        with pytest.raises(OSError, match="Bad file descriptor"):
+            os.fstat(file)
+
+    def test_a_copy_is_in_memory(self, tmp_path: Path) -> None:
+        _, surfels = twins(1, tmp_path)
+        surfels.append(*scattered(1, 500), 0)
+        other = copy.deepcopy(surfels)
+        before = content(surfels)
+        assert content(other) == before
+        other.append(*scattered(2, 500), 1)
+        assert (len(other), other.pages._backing.paged) == (1000, False)
+        assert content(surfels) == before
+
+
+def raising(error: Exception):
+    def call(*arguments: object) -> None:
+        raise error
+
+    return call
 
 
 class TestSameBytes:
@@ -264,3 +298,20 @@ def test_pages_that_a_correction_moved_are_filled_on() -> None:
     assert surfels.pages.counts[surfels.pages.live].tolist() == [110]
     assert surfels.pages.probation[surfels.pages.live].max() < NEVER
     assert surfels.capacity % PAGE == 0
+
+
+def test_far_away_surfels_of_one_cell_share_a_page() -> None:
+    """Beyond 262 km keys would be negative, as those of free places in the table are."""
+    surfels = sw.SurfelMap()
+    positions, ones = np.full((3, 5), -1e6, np.float32), np.ones((3, 5), np.float32)
+    surfels.append(positions, ones, ones, ones[0], ones[0], 0)
+    assert surfels.pages.counts[surfels.pages.live].tolist() == [5]
+
+
+def test_numbers_of_surfels_end_somewhere(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("scanweld.mapping.storage.pages.MOST_PAGES", 300)
+    surfels = sw.SurfelMap(16)
+    surfels.append(*scattered(1, 300), 0)
+    assert (len(surfels), surfels.capacity) == (300, 300 * PAGE)
+    with pytest.raises(sw.InvalidInputError, match="at most 300 pages"):
+        surfels.append(*scattered(2, 300), 1)

@@ -97,6 +97,50 @@ def test_two_callers_at_once() -> None:
     assert all((total == 200).all() for total in totals)
 
 
+@pytest.mark.usefixtures("threads")
+def test_a_busy_worker_is_not_waited_for() -> None:
+    set_num_threads(2)
+    busy, ended, done = threading.Barrier(3), threading.Event(), np.zeros(2)
+
+    def hold(start: int, stop: int) -> None:
+        busy.wait(10)
+        ended.wait(10)
+
+    other = threading.Thread(target=lambda: run_ranges(2, hold))
+    other.start()
+    busy.wait(10)
+    mine = threading.Thread(target=lambda: run_ranges(2, lambda start, stop: done.__setitem__(slice(start, stop), 1)))
+    mine.start()
+    mine.join(5)
+    was_waiting = mine.is_alive()
+    ended.set()
+    other.join(10)
+    mine.join(10)
+    assert not was_waiting
+    assert done.all()
+
+
+@pytest.mark.usefixtures("threads")
+def test_number_of_threads_may_change_while_another_thread_shares_out_work() -> None:
+    failures: list[BaseException] = []
+    stop = threading.Event()
+
+    def work() -> None:
+        try:
+            while not stop.is_set():
+                run_ranges(8, lambda start, stop: None)
+        except BaseException as error:
+            failures.append(error)
+
+    caller = threading.Thread(target=work)
+    caller.start()
+    for k in range(200):
+        set_num_threads(2 + k % 2)
+    stop.set()
+    caller.join(30)
+    assert failures == []
+
+
 @pytest.mark.parametrize("count", [0, -1])
 def test_number_of_threads_must_be_positive(count: int) -> None:
     with pytest.raises(sw.InvalidInputError, match="at least one thread"):
@@ -189,6 +233,21 @@ if child == 0:
 print(os.waitpid(child, 0)[1])
 """
     assert fresh_python(code) == "0"
+
+
+def test_forked_child_waits_for_nothing_that_its_parent_does() -> None:
+    code = """
+import os, signal, time, warnings
+warnings.simplefilter("ignore")
+from scanweld.parallel import in_background
+slow = in_background(lambda: time.sleep(0.3) or 7)
+child = os.fork()
+if child == 0:
+    signal.alarm(20)
+    os._exit(slow.result() + in_background(lambda: 1).result())
+print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), slow.result())
+"""
+    assert fresh_python(code) == "8 7"
 
 
 def test_import_of_the_package_loads_no_compiler() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -98,6 +99,30 @@ class TestPipelined:
         mapper.fuse(*frames(1)[0])
         with pytest.raises(MemoryError, match="no room"):
             len(mapper.map)
+
+    def test_buffers_of_a_camera_may_be_filled_again(self) -> None:
+        slow, (pyramid, T) = SlowMapper(), frames(1)[0]
+        mapper = PipelinedMapper(slow)
+        buffer = np.full((*CAMERA.shape, 3), 200, np.uint8)
+        slow.may_fuse.clear()
+        mapper.fuse(replace(pyramid, frame=replace(pyramid.frame, color=buffer)), T)
+        buffer[:] = 0
+        slow.may_fuse.set()
+        assert (mapper.map.colors == 200).all()
+
+    def test_several_may_wait_for_the_map(self) -> None:
+        slow = SlowMapper()
+        mapper, sizes = PipelinedMapper(slow), []
+        slow.may_fuse.clear()
+        mapper.fuse(*frames(1)[0])
+        waiting = [threading.Thread(target=lambda: sizes.append(len(mapper.map))) for _ in range(4)]
+        for thread in waiting:
+            thread.start()
+        slow.may_fuse.set()
+        for thread in waiting:
+            thread.join(30)
+        assert len(sizes) == 4
+        assert min(sizes) == max(sizes) > 0
 
 
 def test_same_bytes_at_any_number_of_threads() -> None:

@@ -249,6 +249,13 @@ class TestHonesty:
         assert [direction.words for direction in result.unobservable] == ["translation along (0.00, 1.00, 0.00)"]
         np.testing.assert_allclose(result.T_target_source[:3, 3], [0, 0.05, 0], atol=2e-3)
 
+    def test_a_single_point_is_too_few(self) -> None:
+        target = sw.build_pyramid(frame_of(np.ones(CAMERA.shape, np.float32)))
+        point = np.array([[0], [0], [1]], np.float32)
+        result = align_projective(point, -point, target.levels, np.eye(4))
+        assert result.status is sw.Status.TOO_FEW_CORRESPONDENCES
+        assert np.isfinite(result.T_target_source).all()
+
     def test_no_depth_is_too_few(self) -> None:
         levels, positions, normals = room_points()
         empty = sw.build_pyramid(frame_of(np.zeros(CAMERA.shape)))

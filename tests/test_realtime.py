@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 import scanweld as sw
-from rendered import MemorySequence, rendered
+from rendered import MemorySequence, rendered, write_tum_folder
+from scanweld.cli import app as command_line
 from scanweld.cli.progress import FrameProgress
 from scanweld.cli.slam import summary_text
 from scanweld.datasets.playback import play
@@ -179,3 +180,13 @@ def test_progress_counts_dropped_frames(capsys: pytest.CaptureFixture[str], monk
     lines = capsys.readouterr().err.splitlines()
     assert "dropped" not in lines[0]
     assert lines[2].endswith("1 dropped")
+
+
+def test_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """By the clock of the machine: how many frames are dropped is not known, only that all are told."""
+    folder = write_tum_folder(tmp_path / "room", rendered().part(0, 5))
+    code = command_line.run(["slam", str(folder), "--realtime", "--json", "--out", str(tmp_path / "run")])
+    metrics = json.loads(capsys.readouterr().out)
+    assert code == 0
+    assert (metrics["frames"], metrics["frames_tracked"] + metrics["frames_dropped"]) == (5, 5)
+    assert json.loads((tmp_path / "run/run.json").read_text())["realtime"] is True

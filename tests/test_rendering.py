@@ -116,6 +116,12 @@ def test_plain_view_and_its_pixels() -> None:
     assert view.intensities is None
 
 
+def test_view_must_hold_the_rows_of_its_image() -> None:
+    none, index_map = np.zeros((3, 0), np.float32), np.zeros(SMALL.shape, np.int32)
+    with pytest.raises(sw.InvalidInputError, match="row 0 of a view of 0 rows"):
+        sw.ModelView(POSE, SMALL, none, none, none[0], index_map)
+
+
 def test_speck_does_not_hide_the_surface_it_belongs_to() -> None:
     """A doubtful surfel 1 % nearer than a stable one loses, 3 % nearer it wins."""
     for nearer, winner in ((0.99, 0), (0.97, 1)):

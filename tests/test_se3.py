@@ -170,6 +170,13 @@ def test_transforms_of_the_plane():
     np.testing.assert_allclose(se3.transform_points(T, [[1.0, 0.0]]), [[1.6, 2.8]])
 
 
+@pytest.mark.parametrize("value", [np.inf, np.nan, 1e120, 1e200])
+def test_a_rotation_beyond_all_bounds_is_none(value):
+    """NaN, as of an array of rotations, which has no exceptions either."""
+    with np.errstate(all="ignore"):
+        assert np.isnan(se3.exp([0, 0, 0, value, 0, 0])[:3, :3]).all()
+
+
 def test_arguments_are_not_modified():
     xi = np.array([1.0, 2, 3, 0.1, 0.2, 0.3])
     T = se3.exp(xi)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from scanweld.arrays import Float32, Float64, Int32, Int64
+from scanweld.errors import InvalidInputError
 from scanweld.geometry.camera import PinholeCamera
 
 
@@ -50,6 +51,11 @@ class ModelView:
         self.T_world_camera, self.camera, self.index_map = T_world_camera, camera, index_map
         self.positions_m, self.normals, self.confidences = positions_m, normals, confidences
         self.stable_confidence, self.intensities = stable_confidence, intensities
+        if index_map.max(initial=-1) >= len(self):  # kernels would read beyond the end
+            raise InvalidInputError(
+                f"index_map: it holds row {index_map.max()} of a view of {len(self)} rows; it is for rows of the view, "
+                "not for numbers of the map's surfels"
+            )
 
     def __len__(self) -> int:
         return int(self.positions_m.shape[1])

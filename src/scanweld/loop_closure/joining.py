@@ -14,6 +14,7 @@ import logging
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -22,6 +23,7 @@ from scanweld.geometry import se3
 from scanweld.geometry.depth import SurfaceConfig
 from scanweld.loop_closure.held_out import fits_together
 from scanweld.loop_closure.keyframes import Keyframe
+from scanweld.state import Stateful
 
 logger = logging.getLogger(__name__)
 
@@ -63,8 +65,11 @@ class Join:
     pairs: tuple[PlacePair, PlacePair]
 
 
-class JoinFinder:
+class JoinFinder(Stateful):
     """Remembers verified pairs of keyframes until a second one says the same."""
+
+    STATE: ClassVar = {"_pairs": deque[PlacePair]}
+    MADE = frozenset({"drift", "surfaces"})
 
     def __init__(self, drift: float, surfaces: SurfaceConfig) -> None:
         self.drift = drift

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 
@@ -27,6 +28,7 @@ from scanweld.loop_closure.place_recognition import KeyframeDatabase, PlaceConfi
 from scanweld.loop_closure.place_verification import VerificationConfig, relocalise, verify_place
 from scanweld.registration.pose_graph import PoseGraph, edge_information
 from scanweld.registration.result import RegistrationResult, Status
+from scanweld.state import Stateful
 from scanweld.trajectory import FrameResult
 
 logger = logging.getLogger(__name__)
@@ -36,7 +38,7 @@ _SIGMA_RAD_PER_M = 0.005
 _UNSEEN_SIGMA = 0.3  # m and rad: what is known of the motion while nothing was seen
 
 
-class NoLoopCloser:
+class NoLoopCloser(Stateful):
     """Remembers nothing and corrects nothing: odometry against the map."""
 
     keyframe = 0
@@ -91,7 +93,7 @@ class _Edge:
     loop: bool
 
 
-class KeyframeLoopCloser:
+class KeyframeLoopCloser(Stateful):
     """Keyframes, places and a pose graph over them.
 
     Attributes
@@ -100,6 +102,12 @@ class KeyframeLoopCloser:
     submap : the one that the camera is in
     num_closures : loops closed so far
     """
+
+    STATE: ClassVar = {
+        "database": Stateful, "num_closures": int, "submap": int, "_submaps": Int64, "_newest": dict[int, int],
+        "_num_submaps": int, "_joins": Stateful, "_edges": list[_Edge], "_seen_since": bool,
+    }  # fmt: skip
+    MADE = frozenset({"config"})
 
     def __init__(self, config: LoopClosingConfig | None = None) -> None:
         self.config = config or LoopClosingConfig()
@@ -182,6 +190,13 @@ class KeyframeLoopCloser:
         ]
         self.submap = join.kept if self.submap == join.joined else self.submap
         return MapCorrection(moved.astype(np.int32), np.tile(join.T_kept_joined, (len(moved), 1, 1)))
+
+    def restored(self) -> None:
+        """Check that submaps and edges are of keyframes that there are."""
+        count = len(self.database)
+        named = [*self._newest.values(), *(k for edge in self._edges for k in (edge.i, edge.j))]
+        if self._submaps.shape != (count,) or not all(0 <= index < count for index in named):
+            raise ValueError("submaps or edges of keyframes that are not there")
 
     def _in_submap(self, submap: int | None = None) -> Bool:
         """Return which keyframes (K,) are those of a submap, by default of the one that the camera is in."""

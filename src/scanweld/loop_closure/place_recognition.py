@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 
@@ -30,6 +31,7 @@ from scanweld.loop_closure.keyframes import (
     sighting_of,
 )
 from scanweld.parallel import run_ranges
+from scanweld.state import Stateful
 
 _WORDS = 16  # of a descriptor
 _WORD_BITS = 16
@@ -66,8 +68,11 @@ class Candidate:
     shared_words: int
 
 
-class KeyframeDatabase:
+class KeyframeDatabase(Stateful):
     """Keyframes in the order in which they were added."""
+
+    STATE: ClassVar = {"_keyframes": list[Keyframe]}
+    MADE = frozenset({"config", "ferns", "_codes", "_has_grey", "_words", "_num_features"})
 
     def __init__(self, config: PlaceConfig | None = None) -> None:
         self.config = config or PlaceConfig()
@@ -124,7 +129,20 @@ class KeyframeDatabase:
                 f"{self.config.keyframes.min_usable:.1%} (min_usable); add frames that `reason` speaks for"
             )
         keyframe = keyframe_of(sighting, T_world_camera, index=len(self), frame_index=frame_index)
-        row = len(self)
+        self._keyframes.append(keyframe)
+        self._note(keyframe)
+        return keyframe
+
+    def restored(self) -> None:
+        """Note what the keyframes are found by."""
+        for index, keyframe in enumerate(self._keyframes):
+            if keyframe.index != index or keyframe.depth_steps.shape != keyframe.camera.shape:
+                raise ValueError(f"keyframe {index} is not that")
+            self._note(keyframe)
+
+    def _note(self, keyframe: Keyframe) -> None:
+        """Note what a keyframe is found by."""
+        row = keyframe.index
         if row == len(self._has_grey):
             self._grow()
         self._codes[row] = keyframe.code.depth, keyframe.code.grey
@@ -132,8 +150,6 @@ class KeyframeDatabase:
         words = words_of(keyframe.features.descriptors[: self.config.indexed_features])
         self._words[row, : len(words)] = words
         self._num_features[row] = len(words)
-        self._keyframes.append(keyframe)
-        return keyframe
 
     def move(self, T_world_camera: Sequence[Float64] | Float64) -> None:
         """Give every keyframe a new pose (K, 4, 4)."""
@@ -183,7 +199,7 @@ class KeyframeDatabase:
         return [Candidate(int(i), float(similarity[i]), int(words[i])) for i in order[:k]]
 
     def _grow(self) -> None:
-        rows = max(64, 2 * len(self))
+        rows = max(64, 2 * len(self._has_grey))
         for name in ("_codes", "_has_grey", "_words", "_num_features"):
             old = getattr(self, name)
             new = np.zeros((rows, *old.shape[1:]), old.dtype)

@@ -31,7 +31,7 @@ class FusionConfig:
     gate_floor_m: float = setting(
         0.005, "and always within this [m]; raise for a wrong camera model, lower for fine detail", low=0.0
     )
-    min_cosine: float = setting(0.5, "merged normals agree at least this well; lower for noise", low=-1.0, high=1.0)
+    min_cosine: float = setting(0.5, "merged normals agree at least this well; lower for noise", low=-0.9, high=1.0)
     spread_pixels: float = setting(
         1.0, "a surfel this near a pixel's centre covers it [pixels]; raise for a smaller map", low=0.5, high=1.5
     )

@@ -163,7 +163,7 @@ def is_seen_through(u, v, x, y, z, gate, margin, surface, width, height, transfo
     """Whether a pixel and its neighbours look through a surfel (x, y, z), which stands in front of them all."""
     if (v <= 0) | (v >= height - 1) | (u <= 0) | (u >= width - 1):
         return False
-    nearest = np.float32(np.inf)
+    nearest = np.float32(1e30)
     for dv in range(-1, 2):
         for du in range(-1, 2):
             nearest = min(nearest, surface[np.uint64(((v + dv) * width + u + du) * 8 + 2)])
@@ -360,7 +360,7 @@ def cover_rows(start, stop, rows, values, merged, surface, moving, transform, in
             copy_eight(surface, (first + np.uint64(columns[n])) * np.uint64(8), seen, n * np.uint64(8))
         # A surfel that landed in a neighbouring pixel may still be near enough to this one's centre: those beside it
         # are asked first, then those at its corners, and what one of them covers is off the list.
-        for k in range(8):
+        for k in range(8 if values.shape[1] > 0 else 0):  # of the first frame there is no view
             sign = 2 * (k & 1) - 1
             dv, du = ((k >> 1) * sign, (1 - (k >> 1)) * sign) if k < 4 else ((k & 2) - 1, sign)
             if (v + dv < 0) | (v + dv >= height):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import numpy as np
 
 from scanweld.arrays import Bool, Float64
@@ -15,14 +17,18 @@ from scanweld.mapping.merging import merge_doubled
 from scanweld.mapping.rendering import find_candidates, render_model_view
 from scanweld.mapping.storage.pages import MapConfig
 from scanweld.mapping.surfel_map import SurfelMap
+from scanweld.state import Stateful
 
 
-class SurfelMapper:
+class SurfelMapper(Stateful):
     """Point-based fusion into a :class:`SurfelMap`.
 
     Fusion looks at the map from the frame's pose anyway; what it saw, `last_seen`, is the view for the next frame, if
     that is expected close by; None when much was new.
     """
+
+    STATE: ClassVar = {"map": Stateful, "_frames_fused": int, "last_seen": ModelView | None, "_reach_m": float}
+    MADE = frozenset({"config", "_depth_buffers"})
 
     def __init__(self, config: FusionConfig | None = None, storage: MapConfig | None = None) -> None:
         self.config = config or FusionConfig()

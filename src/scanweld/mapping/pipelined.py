@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from concurrent.futures import Future, wait
-from typing import Any
+from dataclasses import replace
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -15,14 +16,18 @@ from scanweld.mapping.fusion import FusionConfig
 from scanweld.mapping.mapper import SurfelMapper, shows_the_same
 from scanweld.mapping.surfel_map import SurfelMap
 from scanweld.parallel import get_num_threads, in_background, limited_threads
+from scanweld.state import Stateful
 
 
-class PipelinedMapper:
+class PipelinedMapper(Stateful):
     """A :class:`SurfelMapper` that fuses each frame on a thread of its own while the next one is tracked.
 
     That one is tracked against what the fusion before saw, where the camera is still close by: always, also when
     fusion has ended already, so results do not depend on timing. Whatever else needs the map waits for it.
     """
+
+    STATE: ClassVar = {"settled": Stateful, "_seen": ModelView | None}
+    MADE = frozenset({"_mapper", "_fusing"})
 
     def __init__(self, mapper: SurfelMapper) -> None:
         self._mapper = mapper
@@ -32,9 +37,10 @@ class PipelinedMapper:
     @property
     def settled(self) -> SurfelMapper:
         """The mapper, with all frames fused; raises what fusion has raised."""
-        if self._fusing is not None:
-            wait([self._fusing])  # whoever is interrupted here still has it to wait for
-            fusing, self._fusing = self._fusing, None
+        fusing = self._fusing
+        if fusing is not None:
+            wait([fusing])  # whoever is interrupted here still has it to wait for
+            self._fusing = None
             fusing.result()
         return self._mapper
 
@@ -48,7 +54,7 @@ class PipelinedMapper:
 
     @property
     def map(self) -> SurfelMap:
-        """The map, with all frames fused."""
+        """The map, with all frames fused; to be asked for anew after the next one, which changes it from behind."""
         return self.settled.map
 
     def view(self, T_world_camera: Float64, camera: PinholeCamera) -> ModelView:
@@ -61,9 +67,11 @@ class PipelinedMapper:
         self, pyramid: SurfacePyramid, T_world_camera: Float64, *, keyframe: int = 0, moving: Bool | None = None
     ) -> None:
         """Begin to merge a frame into the map, as :meth:`SurfelMapper.fuse` does; waits for the one before."""
-        mapper = self.settled
+        mapper, frame = self.settled, pyramid.frame
         self._seen = mapper.last_seen if _is_settled(mapper.last_seen) else None
         threads = get_num_threads()
+        if threads > 1 and frame.color is not None:  # a camera may fill its buffer with the next picture meanwhile
+            pyramid = replace(pyramid, frame=replace(frame, color=frame.color.copy()))
 
         def fuse() -> None:
             with limited_threads(max(1, threads // 2)):  # tracking needs the others

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from functools import partial
+from typing import ClassVar
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from scanweld.mapping.storage.kernels import PAGE, ROWS
 from scanweld.mapping.storage.pages import MapConfig, PagePool
 from scanweld.notebook import card, seen_from_above
 from scanweld.parallel import run_ranges
+from scanweld.state import Stateful
 
 _ROWS: dict[str, tuple[slice, type]] = {
     "positions_m": (slice(0, 3), np.float32),
@@ -28,7 +30,7 @@ _ROWS: dict[str, tuple[slice, type]] = {
 """In which rows of a page a property is kept, and as what."""
 
 
-class SurfelMap:
+class SurfelMap(Stateful):
     """A growing set of oriented discs with colour and confidence.
 
     Surfels live in pages, each of them within one cell of space (docs/decisions/0012-blocks.md): what is out of view
@@ -37,6 +39,8 @@ class SurfelMap:
     Properties are read-only copies of the live surfels, page by page; new ones are not always the last. A map may be
     larger than memory (`MapConfig.memory_budget_mb`); then :meth:`batches` and :meth:`sample` are for it.
     """
+
+    STATE: ClassVar = {"pages": Stateful, "anchor": int}
 
     def __init__(self, capacity: int = 1 << 16, config: MapConfig | None = None) -> None:
         self.pages = PagePool(-(-capacity // PAGE), config)

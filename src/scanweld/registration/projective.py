@@ -382,7 +382,7 @@ def _centroid_and_radius(points_m: Float64) -> tuple[Float64, float]:
     if len(points_m) == 0:
         return np.zeros(3), 1.0
     centroid = points_m.mean(axis=0)
-    return centroid, float(np.sqrt(((points_m - centroid) ** 2).sum(axis=1).mean()))
+    return centroid, float(np.sqrt(((points_m - centroid) ** 2).sum(axis=1).mean())) or 1.0  # a single point has none
 
 
 def _judge(

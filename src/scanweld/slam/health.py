@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -11,6 +12,7 @@ from scanweld.arrays import Float64
 from scanweld.config import check_ranges, setting
 from scanweld.geometry import se3
 from scanweld.registration.result import RegistrationResult
+from scanweld.state import Stateful
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -42,8 +44,11 @@ _LEAST_SPREAD = 0.1  # of the median: a perfectly steady value is no reason to b
 _LEAST_LEAP_M, _LEAST_LEAP_RAD = 0.03, 0.05  # per frame: less is no leap, however steady the camera was
 
 
-class TrackingHealth:
+class TrackingHealth(Stateful):
     """Keeps the distribution of what tracking reports, and looks for signs that it has slipped."""
+
+    STATE: ClassVar = {"_rmse": deque[float], "_overlap": deque[float], "_leaps": deque[tuple[float, float]]}
+    MADE = frozenset({"config"})
 
     def __init__(self, config: HealthConfig | None = None) -> None:
         self.config = config or HealthConfig()

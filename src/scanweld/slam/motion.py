@@ -6,12 +6,14 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
+from typing import ClassVar
 
 import numpy as np
 
 from scanweld.arrays import Float64
 from scanweld.geometry import se3
 from scanweld.registration.result import RegistrationResult
+from scanweld.state import Stateful
 from scanweld.trajectory import FrameResult, FrameState, Trajectory
 
 POSED = (FrameState.TRACKING, FrameState.RELOCALISED)
@@ -46,7 +48,7 @@ STEADIEST = 0.02
 """The velocity of a camera that has stood still changes by so much [m/s, rad/s] in a second: it will be taken up."""
 
 
-class ConstantVelocity:
+class ConstantVelocity(Stateful):
     """Predicts that the camera goes on as it moved: a Kalman filter that takes its noises from the track itself.
 
     The state is the pose, perturbed in the camera's own frame, T <- T exp(x), and the velocity, which changes at random
@@ -54,6 +56,13 @@ class ConstantVelocity:
     before, and no surer; without any measurement the camera slows down and stops. While poses are measured in full the
     last step says best where the next one begins, and the filter's smoother velocity waits for when they are not.
     """
+
+    STATE: ClassVar = {
+        "_T_world_camera": Float64, "_timestamp_s": float | None, "_velocity": Float64, "_covariance": Float64,
+        "_seen_velocity": Float64, "_seen_for_s": float, "_measured": tuple[float, Float64] | None, "_in_full": bool,
+        "_weighed": tuple[Float64, Float64, Float64] | None, "_unsteadiness": Stateful,
+    }  # fmt: skip
+    MADE = frozenset({"decay"})
 
     def __init__(self, decay: float = 0.8) -> None:
         self.decay = decay
@@ -205,7 +214,7 @@ class ConstantVelocity:
         return T_world_camera
 
 
-class Unsteadiness:
+class Unsteadiness(Stateful):
     """How unevenly a camera moves, and how much its measured poses jitter, from the track of the last seconds.
 
     A step differs from the one before by a change of the velocity and by the jitter of three poses, d = c + n0 - 2 n1 +
@@ -218,6 +227,11 @@ class Unsteadiness:
 
     LEAST = 10
     """Fewer tell nothing yet."""
+
+    STATE: ClassVar = {
+        "_differences": deque[tuple[float, Float64, Float64 | None]],
+        "_last": tuple[float, Float64, Float64 | None] | None,
+    }
 
     def __init__(self) -> None:
         self._differences: deque[tuple[float, Float64, Float64 | None]] = deque(maxlen=self.WINDOW)

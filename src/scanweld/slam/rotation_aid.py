@@ -9,6 +9,7 @@ smaller than those of the motion model.
 from __future__ import annotations
 
 from collections import deque
+from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -16,6 +17,7 @@ import numpy.typing as npt
 from scanweld.arrays import Float64, as_transform
 from scanweld.errors import InvalidInputError
 from scanweld.geometry import se3
+from scanweld.state import Stateful
 
 _WINDOW = 30  # frames that tell how good it is
 _LEAST_FRAMES = 5  # before which nothing is known of it
@@ -34,8 +36,14 @@ def as_rotation(rotation: npt.ArrayLike, name: str) -> Float64:
     return as_transform(T, name)[:3, :3]
 
 
-class RotationAid:
+class RotationAid(Stateful):
     """Follows a gyroscope's orientation, its bias and its errors."""
+
+    STATE: ClassVar = {
+        "bias_rad_s": Float64, "_num_compared": int, "_errors_rad": deque[tuple[float, float]],
+        "_last": tuple[float, Float64] | None, "_turned": Float64, "_seen": tuple[float, Float64, Float64] | None,
+        "_R_model": Float64,
+    }  # fmt: skip
 
     def __init__(self) -> None:
         self.bias_rad_s: Float64 = np.zeros(3)

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 
@@ -21,6 +22,7 @@ from scanweld.loop_closure.joining import Join
 from scanweld.registration.result import RegistrationResult
 from scanweld.slam.motion import POSED
 from scanweld.slam.stages import LoopCloser, Mapper, SubmapLoopCloser, SubmapMapper
+from scanweld.state import Stateful
 from scanweld.trajectory import FrameResult, FrameState
 
 
@@ -48,11 +50,17 @@ class SubmapConfig:
 _LEAST_TRIES = 10  # frames that were looked for in vain, whatever the clock says
 
 
-class Atlas:
+class Atlas(Stateful):
     """The mappers of all submaps and the loop closer that knows the places of all.
 
     Stages that know no submaps make an atlas of one.
     """
+
+    STATE: ClassVar = {
+        "submaps": list[int], "mappers": dict[int, Stateful], "active": int, "num_joins": int, "_tries": int,
+        "_lost_at_s": float,
+    }  # fmt: skip
+    MADE = frozenset({"config", "_loop_closer"})
 
     def __init__(self, mapper: Mapper, loop_closer: LoopCloser, config: SubmapConfig | None = None) -> None:
         self.config = config or SubmapConfig()
@@ -67,6 +75,23 @@ class Atlas:
     def mapper(self) -> Mapper:
         """That of the submap that the camera is in."""
         return self.mappers[self.active]
+
+    @property
+    def submaps(self) -> list[int]:
+        """The numbers of the submaps, in the order of the mappers; where they are set, new ones have empty maps."""
+        return list(self.mappers)
+
+    @submaps.setter
+    def submaps(self, numbers: list[int]) -> None:
+        mapper = self.mapper
+        if not isinstance(mapper, SubmapMapper):
+            raise ValueError("a mapper of one map has several")
+        self.mappers = {number: self.mappers.get(number) or mapper.fresh() for number in numbers}
+
+    def restored(self) -> None:
+        """Check that the camera is in a submap that there is."""
+        if self.active not in self.mappers:
+            raise ValueError(f"the camera is in submap {self.active}, which is not there")
 
     def look_for(self, pyramid: SurfacePyramid) -> tuple[int, RegistrationResult]:
         """Look for a lost camera in all submaps; T_target_source is in the world of the submap that is returned."""

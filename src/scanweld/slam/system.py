@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -33,6 +33,7 @@ from scanweld.slam.motion import POSED, UNSEEN, ConstantVelocity, trajectory_of
 from scanweld.slam.rotation_aid import RotationAid, as_rotation
 from scanweld.slam.stages import LoopCloser, Mapper, Tracker
 from scanweld.slam.submaps import Atlas, SubmapConfig, in_one_world, main_submap
+from scanweld.state import Stateful
 from scanweld.tracking.dynamics import DynamicsConfig, MotionDetector, leave_out, track_static
 from scanweld.tracking.tracker import FrameToModelTracker, TrackingConfig
 from scanweld.trajectory import FrameResult, FrameState, Trajectory
@@ -66,13 +67,21 @@ class SlamConfig:
 _LOOP_CLOSERS = ("keyframes", "none")
 
 
-class Slam:
+class Slam(Stateful):
     """Dense SLAM whose stages are given, each behind a Protocol; without `dynamics` the scene is taken to stand still.
 
     The world frame is that of the first frame unless `T_world_first` says otherwise. A camera that is lost for good
     begins a submap with a world of its own (:mod:`~.submaps`): `map` and `trajectory` are those of the main one, which
     has the most measured frames.
     """
+
+    STATE: ClassVar = {
+        "loop_closer": Stateful, "atlas": Stateful, "_results": list[FrameResult],
+        "_num_surfels": int, "_uncounted": int,
+        "_keyframes": list[int], "_last_posed": int, "_health": Stateful, "_dynamics": Stateful | None,
+        "_moving": Bool | None, "_motion": Stateful, "_rotation": Stateful,
+    }  # fmt: skip
+    MADE = frozenset({"tracker", "surfaces", "_T_world_first"})
 
     def __init__(
         self,
@@ -91,7 +100,8 @@ class Slam:
         self.atlas = Atlas(mapper, self.loop_closer, submaps)
         self.surfaces = surfaces or SurfaceConfig()
         self._results: list[FrameResult] = []
-        self._num_surfels = 0  # after the last frame but one, or the last: see `_count`
+        self._num_surfels = 0  # of the map at hand, as far as is known: see `_count`
+        self._uncounted = 0  # the first frame whose map has not been counted
         self._keyframes: list[int] = []  # that each result moves with
         self._last_posed = -1  # the frame that the camera was last tracked in
         self._health = TrackingHealth(health)
@@ -114,7 +124,7 @@ class Slam:
 
     @property
     def map(self) -> Any:
-        """The map of the main submap."""
+        """The map of the main submap; to be asked for anew after each frame, which may still be fused into it."""
         return self.maps[main_submap(self._results)]
 
     @property
@@ -136,6 +146,11 @@ class Slam:
     def trajectory(self) -> Trajectory:
         """One pose per processed frame, LOST stretches interpolated where tracking was regained."""
         return trajectory_of(self.main_results)
+
+    def restored(self) -> None:
+        """Check that the frames so far are numbered, each with its keyframe."""
+        if len(self._results) != len(self._keyframes) or any(r.index != k for k, r in enumerate(self._results)):
+            raise ValueError("the frames so far are not numbered")
 
     def prepare(self, frame: Frame) -> SurfacePyramid:
         """Compute the surfaces of a frame as `process` does, with the caller's thread alone.
@@ -333,7 +348,6 @@ class Slam:
 
     def _enter(self, submap: int) -> None:
         """Go on in another submap: what was usual, and how the camera moved, was in another world."""
-        self._count()
         self._num_surfels = 0
         self.atlas.enter(submap)
         self._health, self._motion = TrackingHealth(self._health.config), ConstantVelocity()
@@ -346,10 +360,11 @@ class Slam:
         return self._num_surfels > 0 or len(self.mapper.map) > 0
 
     def _count(self) -> None:
-        """Note how large the map is after the last frame; a mapper that is still fusing it is waited for."""
-        if self._results and self._results[-1].submap == self.atlas.active:
-            self._num_surfels = len(self.mapper.map)
-            self._results[-1] = replace(self._results[-1], num_surfels=self._num_surfels)
+        """Note how large the map is after the last frame that was fused; a mapper that is still at it is waited for."""
+        for index in range(self._uncounted, len(self._results)):
+            surfels = len(self.atlas.mappers[self._results[index].submap].map)
+            self._results[index] = replace(self._results[index], num_surfels=surfels)
+        self._uncounted, self._num_surfels = len(self._results), len(self.mapper.map)
 
     def _close_loops(self, pyramid: SurfacePyramid, result: FrameResult) -> None:
         """Let the loop closer look at a tracked frame, and do what follows."""

@@ -145,14 +145,15 @@ class FrameToModelTracker:
         config = self.config
         least, count = view.stable_confidence, int(np.count_nonzero(view.confidences >= view.stable_confidence))
         if count < MIN_STABLE_SHARE * len(view):
-            least, count = -np.inf, len(view)
+            least, count = 0.0, len(view)
         wanted = max(round(config.stable_fraction * count), config.projective.min_points)
         if wanted >= count:
             return _listed(view, least, -(-count // config.projective.max_points))
         rows = _listed(view, least)
         # Confidence stops growing, so ties are the rule: those at the limit are taken evenly over the image.
         confidences = view.confidences[rows]
-        limit = np.partition(confidences, count - wanted)[count - wanted]
+        wanted = min(wanted, len(rows))
+        limit = np.partition(confidences, len(rows) - wanted)[len(rows) - wanted]
         above, tied = np.flatnonzero(confidences > limit), np.flatnonzero(confidences == limit)
         more = wanted - len(above)
         rows = rows[np.sort(np.concatenate([above, tied[np.arange(more) * len(tied) // more]]))]

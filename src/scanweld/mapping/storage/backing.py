@@ -8,6 +8,7 @@ import os
 import tempfile
 import weakref
 from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
 
@@ -47,6 +48,9 @@ class MappedFile(Memory):
         self._file: int | None = None
         self._map: mmap.mmap | None = None
 
+    def __getstate__(self) -> dict[str, Any]:
+        return {"_folder": self._folder, "_file": None, "_map": None}  # a copy of the map is in memory
+
     @property
     def paged(self) -> bool:  # type: ignore[override]
         """Whether parts of the array can leave memory: not where the file could not be made, nor without `madvise`."""
@@ -63,7 +67,7 @@ class MappedFile(Memory):
                 "memory_budget_mb: no file of %.0f MB for the map in %s (%s); the map stays in memory from here on",
                 4e-6 * size, self._folder or tempfile.gettempdir(), getattr(error, "strerror", None) or error,
             )  # fmt: skip
-            self._map = None
+            self._give_up()
             return super().grow(array, size)
         return grown
 
@@ -88,10 +92,16 @@ class MappedFile(Memory):
         if self._file is None:
             with tempfile.TemporaryFile(dir=self._folder or None) as file:
                 self._file = os.dup(file.fileno())
-            weakref.finalize(self, os.close, self._file)
+            self._close = weakref.finalize(self, os.close, self._file)
         if hasattr(os, "posix_fallocate"):  # a full disk is an error here, and would be a crash when it is written to
             os.posix_fallocate(self._file, 0, 4 * size)
         else:
             os.ftruncate(self._file, 4 * size)
         self._map = mmap.mmap(self._file, 4 * size)
         return np.frombuffer(self._map, np.float32)
+
+    def _give_up(self) -> None:
+        """Let go of the file: the disk has the room back as soon as the last array over it is gone."""
+        if self._file is not None:
+            self._close()
+        self._file = self._map = None

@@ -99,10 +99,11 @@ def find_cell(key, keys):
 
 @kernel
 def cell_key(x, y, z, per_cell):
-    """Key of the cell that a place lies in."""
-    key = np.int64(np.floor(x * per_cell)) + np.int64(1 << 20)
-    key = (key << np.int64(21)) | (np.int64(np.floor(y * per_cell)) + np.int64(1 << 20))
-    return (key << np.int64(21)) | (np.int64(np.floor(z * per_cell)) + np.int64(1 << 20))
+    """Key of the cell that a place lies in, never negative; cells 524 km apart share one."""
+    half, mask = np.int64(1 << 20), np.int64((1 << 21) - 1)
+    key = (np.int64(np.floor(x * per_cell)) + half) & mask
+    key = (key << np.int64(21)) | ((np.int64(np.floor(y * per_cell)) + half) & mask)
+    return (key << np.int64(21)) | ((np.int64(np.floor(z * per_cell)) + half) & mask)
 
 
 @kernel

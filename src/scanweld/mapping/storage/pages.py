@@ -5,16 +5,19 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
+from typing import ClassVar
 
 import numpy as np
 
 from scanweld.arrays import Array, Bool, Float32, Float64, Int32, Int64, UInt8
 from scanweld.config import check_ranges, setting
+from scanweld.errors import InvalidInputError
 from scanweld.mapping.storage import kernels
 from scanweld.mapping.storage.backing import MappedFile, Memory
 from scanweld.mapping.storage.kernels import PAGE, ROWS, SHELF, SPAN, STRIDE
 from scanweld.mapping.storage.residence import Residence
 from scanweld.parallel import run_ranges
+from scanweld.state import Stateful
 
 CELL_M = 0.25
 """Edge of the cells that pages belong to [m]: a page is in view or not as a whole, and a cell of a wall seen from 3 m
@@ -32,8 +35,14 @@ NEVER = 0x7FFFFFFF
 FEWEST_CELLS = 16
 """Room of the table of cells at first, a power of two: half of it may be taken."""
 
+PART = 512
+"""Pages whose surfels are handed out at once, 7 MB, where all of them are asked for."""
+
 SPARSE = PAGE // 4
 """A page that is left with fewer surfels is given up."""
+
+MOST_PAGES = 0x7FFFFFFF // PAGE
+"""The number of a surfel is an int32."""
 
 _PER_CELL = np.float32(1 / CELL_M)
 
@@ -57,7 +66,7 @@ class MapConfig:
         check_ranges(self)
 
 
-class PagePool:
+class PagePool(Stateful):
     """Pages in one array that grows when it is full, and a hash table of the cells that they lie in.
 
     With a memory budget the array is a file, of which the shelves that were used last are in memory. A shelf is used by
@@ -75,6 +84,13 @@ class PagePool:
     dirty : (capacity,) uint8, pages with a surfel that lost confidence
     total : surfels of all pages
     """
+
+    STATE: ClassVar = {
+        "counts": Int32, "boxes": Float32, "shelves": Float32, "cells": Int64, "probation": Int32, "dirty": UInt8,
+        "total": int, "_looks": int, "_waiting": dict[int, list[Int32]], "_keys": Int64, "_tails": Int32,
+        "_room": int, "free": Int32, "contents": Iterator[Float32],
+    }  # fmt: skip
+    MADE = frozenset({"config", "_backing", "_residence", "pool", "_free", "_num_free"})
 
     def __init__(self, capacity: int, config: MapConfig | None = None) -> None:
         self.config = config or MapConfig()
@@ -115,6 +131,59 @@ class PagePool:
     def live(self) -> Int64:
         """Slots of the pages with surfels."""
         return np.flatnonzero(self.counts)
+
+    @property
+    def free(self) -> Int32:
+        """Slots of the pages that are free; the last is taken first."""
+        return self._free[: self._num_free]
+
+    @free.setter
+    def free(self, slots: Int32) -> None:
+        self._free, self._num_free = np.empty(self.capacity, np.int32), len(slots)
+        self._free[: len(slots)] = slots
+
+    @property
+    def contents(self) -> Iterator[Float32]:
+        """The surfels (ROWS, N) of all pages, part by part."""
+        for slots in self.batches():
+            for start in range(0, len(slots), PART):
+                yield self.rows_in(slots[start : start + PART])
+
+    @contents.setter
+    def contents(self, parts: Iterator[Float32]) -> None:
+        self._check()
+        self.pool = self._backing.grow(np.empty(0, np.float32), self.capacity * SPAN)
+        self._residence = Residence(self._backing, SHELF * SPAN, int(self.config.memory_budget_mb * 1e6 / 4))
+        self._residence.grow(len(self.shelves))
+        slots = self.live
+        for rows in parts:
+            ends = np.cumsum(self.counts[slots])
+            num = int(np.searchsorted(ends, rows.shape[-1], side="right"))
+            if rows.shape != (ROWS, ends[num - 1] if num else -1):
+                raise ValueError("a part of a page")
+            self.use(slots[:num])
+            for slot, page in zip(slots[:num].tolist(), np.split(rows, ends[: num - 1], axis=1), strict=True):
+                self.page(slot)[:] = page
+            slots = slots[num:]
+        if len(slots):
+            raise ValueError("pages are missing")
+
+    def _check(self) -> None:
+        """Raise ValueError where kernels would leave the arrays."""
+        right = all(getattr(self, name).shape == values.shape for name, values in _columns(self.capacity).items())
+        right = right and bool((self.counts >= 0).all() and (self.counts <= PAGE).all())
+        if not right or self.counts.sum(dtype=np.int64) != self.total or self.capacity > MOST_PAGES:
+            raise ValueError("pages of other sizes")
+        empty = np.flatnonzero(self.counts == 0)
+        if not np.array_equal(np.sort(self.free), empty):
+            raise ValueError("free pages that are not free")
+        size, taken = len(self._keys), int(np.count_nonzero(self._keys >= 0))
+        if size < FEWEST_CELLS or size & (size - 1) or self._tails.shape != (size,) or self._room != size // 2 - taken:
+            raise ValueError("a table of cells of another size")
+        named = [slots for several in self._waiting.values() for slots in several]
+        slots = np.concatenate([*named, self._tails[self._tails != -1]])
+        if len(slots) and (slots.min() < 0 or slots.max() >= self.capacity):
+            raise ValueError("pages that are not there")
 
     @property
     def resident_mb(self) -> float:
@@ -295,9 +364,15 @@ class PagePool:
 
     def _next_capacity(self) -> int:
         """How many pages there should be room for; a file grows without being copied, so by less at a time."""
-        return self.capacity + (max(self.capacity // 4, SHELF) if self._backing.paged else self.capacity)
+        more = max(self.capacity // 4, SHELF) if self._backing.paged else self.capacity
+        return max(min(self.capacity + more, MOST_PAGES), self.capacity + 1)
 
     def _grow(self, capacity: int) -> None:
+        if capacity > MOST_PAGES:
+            raise InvalidInputError(
+                f"map: expected at most {MOST_PAGES:,} pages of {PAGE} surfels, got {capacity:,}; take every second "
+                "frame or pixel, or map a part of the recording at a time"
+            )
         before = self.capacity
         for name, values in _columns(capacity).items():
             old = getattr(self, name)
@@ -317,6 +392,11 @@ class PagePool:
         tails: Int32 = np.full(len(keys), -1, np.int32)
         filled = kernels.rehash(self._keys, self._tails, self.cells, keys, tails)
         self._keys, self._tails, self._room = keys, tails, len(keys) // 2 - filled
+
+
+def _names_others(slots: Int32, capacity: int, least: int) -> bool:
+    """Whether there are slots below `least`, or of pages beyond the capacity."""
+    return slots.ndim != 1 or bool(len(slots) and (slots.min() < least or slots.max() >= capacity))
 
 
 def _places(numbers: Int64) -> Int64:
