@@ -35,7 +35,8 @@ METRICS = {
     "peak_rss_mb", "seconds_total",
 }  # fmt: skip
 EXTRAS = {
-    "frames_unreadable", "path_length_m", "submaps_joined", "submaps_unjoined", "frames_in_unjoined_submaps",
+    "frames_unreadable", "frames_dropped", "path_length_m", "submaps_joined", "submaps_unjoined",
+    "frames_in_unjoined_submaps",
 }  # fmt: skip
 
 

@@ -46,7 +46,7 @@ class FrameProgress:
         self.total, self.title, self.then = total, title, then
         self._console = Console(stderr=True)
         self._live = self._console.is_terminal
-        self._done = self._dropped = 0
+        self._done = self._dropped = self._before = 0
         self._first = self._spoken = time.perf_counter()
 
     def __enter__(self) -> FrameProgress:
@@ -74,10 +74,14 @@ class FrameProgress:
             if self._done:
                 self.title += " again"
                 self._bar.reset(self._task, description=self.title)
-            self._done, self._dropped, self._first = 0, 0, now
+            self._done, self._dropped, self._before, self._first = 0, 0, 0, now
+        elif self._done == 0:  # the frames before this one were taken in by the run that is resumed
+            self._done = self._before = result.index
+            self._first = now
+            self._bar.update(self._task, completed=self._done)
         self._done += 1
         self._dropped += result.state is FrameState.DROPPED
-        taken = self._done - self._dropped
+        taken = self._done - self._before - self._dropped
         fps = (taken - 1) / (now - self._first) if taken > 1 else 0.0
         detail = f"{fps:5.1f} fps  {result.state.name}"
         if not self._live or _is_wide(self._console):

@@ -67,6 +67,13 @@ def slam(
     realtime: Annotated[
         bool, Option("--realtime", help="Play the recording at its own speed; drop frames instead of falling behind.")
     ] = False,
+    resume: Annotated[
+        bool, Option("--resume", help="Continue a run that was interrupted or killed, from its checkpoint.")
+    ] = False,
+    checkpoint_every: Annotated[
+        float | None,
+        Option(help="Seconds between checkpoints, 0: on Ctrl-C only. Default: 60, or what costs 2 %.", min=0.0),
+    ] = None,
     view: Annotated[bool, Option("--view", help="Show the run in the browser while it goes by.")] = False,
     view_host: Annotated[
         str, Option(help="Where --view listens; others than this machine need the token of its address.")
@@ -86,6 +93,7 @@ def slam(
     from scanweld.datasets.base import LiveSequence
     from scanweld.datasets.intrinsics import parse_intrinsics
     from scanweld.datasets.open import open_sequence
+    from scanweld.errors import ConfigError
 
     settings = load_config(config, overrides or [])
     with collected_warnings() as warnings:
@@ -100,6 +108,8 @@ def slam(
         )
     from scanweld.runs.folder import next_run_folder
 
+    if resume and out is None:
+        raise ConfigError("--resume: --out RUN has to say which run is to be continued")
     folder = out or next_run_folder(opened.name)
     given = None if poses is None else given_poses(opened, poses)
     place = str(sequence if isinstance(opened, LiveSequence) else sequence.resolve())
@@ -112,7 +122,7 @@ def slam(
         summary = run_with_progress(
             opened, settings, folder, force=force, poses=given, threads=threads, tracked_only=tracked_only,
             calibrate=calibrate, refine=refine, realtime=realtime, observers=observers.all, description=description,
-            started=started,
+            resume=resume, checkpoint_every_s=checkpoint_every, started=started,
         )  # fmt: skip
         code = print_summary(summary, json_output=json_output)
         if not summary.interrupted:
@@ -178,7 +188,7 @@ def run_with_progress(
 
     if threads is not None:
         set_num_threads(threads)
-    check_writable(folder, force=options.get("force", False))
+    check_writable(folder, force=options.get("force", False), resume=options.get("resume", False))
     then = "adjusting all keyframes together" if options.get("refine") else ""
     if options.get("calibrate"):
         then = "calibrating the camera; where that helps, all frames are tracked again"
@@ -241,4 +251,6 @@ def summary_text(summary: RunSummary) -> str:
         rows.append(("speed", f"{m['fps']:.1f} frames a second; {m['seconds_total']:.1f} s in all"))
     if summary.folder is not None:
         rows.append(("written", f"{summary.folder}/"))
+    if summary.resumable:
+        rows.append(("resume", f"the same command with --out {summary.folder} --resume goes on from here"))
     return "\n".join(f"{name:<8} {text}" for name, text in rows)

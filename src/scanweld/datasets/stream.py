@@ -41,6 +41,7 @@ def stream(
     *,
     num_threads: int = 1,
     prepare: Callable[[Frame], Any] | None = None,
+    first: int = 0,
 ) -> Generator[FrameRecord]:
     """Yield a record for every frame, in order, while the next `lookahead` frames are being decoded.
 
@@ -56,6 +57,7 @@ def stream(
     num_threads : decoding threads, at least 1; the order does not depend on it
     prepare : called with each frame on its decoding thread, so it must depend on the frame alone and not wait for
         the consumer; what it returns waits in memory with the frame
+    first : frames before this one are left out; a live camera has none
 
     Raises
     ------
@@ -68,7 +70,7 @@ def stream(
         raise InvalidInputError(f"stream: expected at least one frame and thread, got {lookahead} and {num_threads}")
     if isinstance(sequence, LiveSequence):
         return _live_records(sequence, prepare)
-    return _records(sequence, lookahead, num_threads, prepare)
+    return _records(sequence, lookahead, num_threads, prepare, first)
 
 
 def read_record(sequence: RgbdSequence, index: int, prepare: Callable[[Frame], Any] | None) -> FrameRecord:
@@ -90,14 +92,14 @@ def _live_records(sequence: LiveSequence, prepare: Callable[[Frame], Any] | None
 
 
 def _records(
-    sequence: RgbdSequence, lookahead: int, num_threads: int, prepare: Callable[[Frame], Any] | None
+    sequence: RgbdSequence, lookahead: int, num_threads: int, prepare: Callable[[Frame], Any] | None, first: int
 ) -> Generator[FrameRecord]:
     count = len(sequence.timestamps_s)
     pending: deque[Future[FrameRecord]] = deque()
     first_fault, num_read = "", 0
     pool = ThreadPoolExecutor(max_workers=num_threads, thread_name_prefix="scanweld-decode")
     try:
-        for index in range(count):
+        for index in range(first, count):
             while len(pending) < lookahead and index + len(pending) < count:
                 pending.append(pool.submit(read_record, sequence, index + len(pending), prepare))
             current = pending.popleft().result()
@@ -110,5 +112,5 @@ def _records(
             yield current
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
-    if num_read == 0:
+    if num_read == 0 and first == 0:
         raise no_readable_frame(sequence.name, count, first_fault)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import glob
 import os
 import shutil
 import tempfile
@@ -12,8 +13,11 @@ from pathlib import Path
 from scanweld.errors import OutputError
 
 
-def write_file(path: Path, content: bytes | Iterable[bytes]) -> None:
+def write_file(path: Path, content: bytes | Iterable[bytes], *, sync: bool = False) -> None:
     """Write a file, or replace one; `content` may come in parts, which are written as they come.
+
+    With `sync` it is on the disk in the end, and not only in the memory of the system: a power cut leaves one or the
+    other, too.
 
     Raises
     ------
@@ -25,8 +29,13 @@ def write_file(path: Path, content: bytes | Iterable[bytes]) -> None:
         with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", delete=False) as file:
             temporary = Path(file.name)
             file.writelines([content] if isinstance(content, bytes) else content)
+            if sync:
+                file.flush()
+                os.fsync(file.fileno())
         temporary.chmod(0o666 & ~_umask())  # temporary files are private, results are not
         temporary.replace(path)
+        if sync:
+            _sync_folder(path.parent)
     except OSError as error:
         raise OutputError(f"{path}: cannot be written: {error.strerror or error}") from None
     finally:
@@ -85,6 +94,17 @@ def write_folder(folder: Path, *, force: bool, kind: str, mark: str) -> Iterator
             shutil.rmtree(aside, ignore_errors=True)
 
 
+def put_back(folder: Path, mark: str) -> None:
+    """Put a folder with a file `mark` back that was killed between the two renames of :func:`write_folder`."""
+    folder = folder.resolve()
+    if folder.exists() or not folder.parent.is_dir():
+        return
+    for old in folder.parent.glob(f".{glob.escape(folder.name)}.*.old"):
+        if (old / mark).is_file():
+            old.rename(folder)
+            return
+
+
 def _folder_beside(folder: Path) -> Path:
     """Make a hidden folder in the place where `folder` shall be; what keeps it from being made keeps `folder`, too."""
     try:
@@ -92,6 +112,16 @@ def _folder_beside(folder: Path) -> Path:
     except OSError as error:
         error.filename = str(folder)
         raise
+
+
+def _sync_folder(folder: Path) -> None:
+    """Have the names of a folder on the disk, where the system can do that."""
+    with contextlib.suppress(OSError):  # Windows, and some network drives
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
 
 
 def _umask() -> int:

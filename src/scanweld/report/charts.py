@@ -186,9 +186,12 @@ def _path_chart(error: AteResult) -> Chart:
 def tracking_charts(frames: FrameTable, shown: Int64) -> list[Chart]:
     """Return residual, overlap and inliers, time of each stage, and growth of the map."""
     aligned = frames.aligned & (frames.inliers > 0)  # an alignment without a single match measured nothing
+    # Lines go on level over dropped frames: single frames between them would be no line.
+    dropped = np.array([state == "dropped" for state in frames.state])
+    held = np.maximum.accumulate(np.where(dropped, 0, np.arange(len(frames))))
 
     def where_aligned(values: Float64) -> Float64:
-        return np.asarray(np.where(aligned, values, np.nan))
+        return np.asarray(np.where(aligned, values, np.nan)[held])
 
     def spread(values: Float64, form: str) -> str:
         usual = values[aligned & frames.posed]
@@ -206,7 +209,8 @@ def tracking_charts(frames: FrameTable, shown: Int64) -> list[Chart]:
 
     total_ms = np.sum(list(frames.stage_ms.values()), axis=0) if frames.stage_ms else np.zeros(len(frames))
     # The first frames compile or fill caches: they must not set the scale.
-    steady = total_ms[min(5, len(frames) - 1) :]
+    taken_ms = total_ms[~dropped]
+    steady = taken_ms[min(5, len(taken_ms) - 1) :]
     grown = frames.surfels[-1]
     return [
         Chart(
@@ -249,7 +253,9 @@ def tracking_charts(frames: FrameTable, shown: Int64) -> list[Chart]:
             title="Time by stage",
             about="Wall time of each frame. The first frames fill caches and may leave the scale.",
             summary=f"median {np.median(steady):.0f} ms a frame, 99 % below {np.percentile(steady, 99):.0f} ms",
-            series=[Series(STAGE_NAMES.get(name, name), values[shown]) for name, values in frames.stage_ms.items()],
+            series=[
+                Series(STAGE_NAMES.get(name, name), values[held][shown]) for name, values in frames.stage_ms.items()
+            ],
             unit="ms",
             stacked=True,
             wide=True,

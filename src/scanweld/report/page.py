@@ -213,7 +213,8 @@ def _tiles(run: RunFiles) -> str:
     """Return the figures that are asked for first."""
     m = run.metrics
     tracked, total = int(run.frames.posed.sum()), len(run.frames)
-    tiles = [("frames tracked", f"{tracked:,}", f"of {total:,}")]
+    dropped = run.frames.state.count("dropped")
+    tiles = [("frames tracked", f"{tracked:,}", f"of {total:,}" + (f", {dropped:,} dropped" if dropped else ""))]
     if m.get("ate_rmse_m") is not None:
         tiles.append(("error of the path (ATE)", length(m["ate_rmse_m"]), f"at most {length(m['ate_max_m'])}"))
     if m.get("rpe_trans_m") is not None:
@@ -247,7 +248,8 @@ def _stretch_table(run: RunFiles, stretches: Sequence[Stretch]) -> str:
     if not stretches and not run.frames.aligned.any():
         return "<p>The poses were given: no frame was tracked.</p>"
     if not stretches:
-        return "<p>Every frame was plainly tracked: aligned with the map, converged, and believed.</p>"
+        which = "frame that was not dropped" if "dropped" in run.frames.state else "frame"
+        return f"<p>Every {which} was plainly tracked: aligned with the map, converged, and believed.</p>"
     shown = sorted(sorted(stretches, key=lambda s: -s.count)[:MAX_ROWS], key=lambda s: s.first)
     rows = "".join(_stretch_row(run, stretch) for stretch in shown)
     left_out = len(stretches) - len(shown)

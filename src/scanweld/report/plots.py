@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from scanweld.report.stretches import KINDS, kind_of
-from scanweld.trajectory import FrameResult
+from scanweld.trajectory import FrameResult, FrameState
 
 _BLUE = "#2563eb"
 
@@ -33,7 +33,8 @@ def plot_tracking(results: Sequence[FrameResult], path: Path) -> None:
     figure = Figure(figsize=(9, 7), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots(4, 1, sharex=True)
-    frames = np.arange(len(results))
+    # Lines lead over dropped frames, which have nothing to show: single frames between them would be no line.
+    frames = np.array([k for k, result in enumerate(results) if result.state is not FrameState.DROPPED])
     aligned = np.array([bool(result.status) and result.num_inliers > 0 for result in results])
     kinds = [kind_of(result.state.value, result.status) for result in results]
     rows = (
@@ -44,7 +45,7 @@ def plot_tracking(results: Sequence[FrameResult], path: Path) -> None:
     )
     for axis, (title, values, label, tracked_only) in zip(axes, rows, strict=True):
         shown = np.where(aligned, values, np.nan) if tracked_only else np.asarray(values, dtype=np.float64)
-        axis.plot(frames, shown, color=_BLUE, linewidth=1.3)
+        axis.plot(frames, shown[frames], color=_BLUE, linewidth=1.3)
         for kind, first, last in _stretches(kinds):
             axis.axvspan(first - 0.5, last + 0.5, color=SHADES[kind], alpha=0.22, linewidth=0)
         axis.set_title(title, loc="left", fontsize=10)
@@ -54,7 +55,7 @@ def plot_tracking(results: Sequence[FrameResult], path: Path) -> None:
         axis.set_axisbelow(True)
         axis.spines[["top", "right"]].set_visible(False)
     # The first frames compile or warm caches: they must not set the scale of the time axis.
-    steady = np.asarray(rows[3][1])[min(5, len(results) - 1) :]
+    steady = np.asarray(rows[3][1])[frames[min(5, len(frames) - 1) :]]
     axes[3].set_ylim(0, 1.3 * max(float(np.percentile(steady, 98)), 1.0))
     axes[1].set_ylim(0, 1.05)
     axes[3].set_xlabel("frame")

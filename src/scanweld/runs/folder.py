@@ -5,9 +5,13 @@ from __future__ import annotations
 import contextlib
 from pathlib import Path
 
+from scanweld.errors import OutputError
 from scanweld.io import atomic
 
 KIND, MARK = "run folder", "run.json"
+
+CHECKPOINT = "checkpoint.swc"
+"""What a run that is not finished can be continued from."""
 
 
 def next_run_folder(name: str, root: Path = Path("runs")) -> Path:
@@ -18,11 +22,23 @@ def next_run_folder(name: str, root: Path = Path("runs")) -> Path:
     return root / f"{name}-{number}"
 
 
-def check_writable(folder: Path, *, force: bool) -> None:
+def check_writable(folder: Path, *, force: bool, resume: bool = False) -> None:
     """Raise OutputError before any work is done when a run could not be written to `folder` at the end."""
-    atomic.check_writable(folder, force=force, kind=KIND, mark=MARK)
+    if (folder / CHECKPOINT).is_file() and not (force or resume):
+        raise OutputError(f"{folder}: holds a run that was interrupted; --resume continues it, --force begins anew")
+    atomic.check_writable(folder, force=force or resume, kind=KIND, mark=_mark(folder))
 
 
 def write_folder(folder: Path, *, force: bool) -> contextlib.AbstractContextManager[Path]:
-    """Yield an empty folder that becomes the run folder; see :func:`scanweld.io.atomic.write_folder`."""
-    return atomic.write_folder(folder, force=force, kind=KIND, mark=MARK)
+    """Yield an empty folder that becomes the run folder; see :func:`scanweld.io.atomic.write_folder`.
+
+    A checkpoint of the run that is in its place goes when the run is there.
+    """
+    mark = _mark(folder)
+    return atomic.write_folder(folder, force=force or mark == CHECKPOINT, kind=KIND, mark=mark)
+
+
+def _mark(folder: Path) -> str:
+    """Return the file that tells a run folder: one of a run that was killed holds nothing but its checkpoint."""
+    unfinished = (folder / CHECKPOINT).is_file() and not (folder / MARK).is_file()
+    return CHECKPOINT if unfinished else MARK

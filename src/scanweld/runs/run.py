@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -26,6 +26,7 @@ from scanweld.geometry.frame import Frame
 from scanweld.notebook import BAD, DOUBTFUL, GOOD, card
 from scanweld.refinement.refine import Refinement
 from scanweld.runs.calibrated import CalibratedSequence
+from scanweld.runs.checkpoint.keeper import Checkpoints
 from scanweld.runs.folder import check_writable, write_folder
 from scanweld.runs.interrupts import Patience
 from scanweld.runs.observer import RunObserver
@@ -35,6 +36,7 @@ from scanweld.runs.refining import described
 from scanweld.slam.motion import POSED, UNSEEN
 from scanweld.slam.system import Slam, SlamConfig, build_slam
 from scanweld.slam.warmup import load_kernels
+from scanweld.state import Stateful
 from scanweld.trajectory import FrameResult, FrameState, Trajectory
 
 logger = logging.getLogger(__name__)
@@ -61,6 +63,7 @@ class RunSummary:
     map : the surfel map, of the main submap
     interrupted : Ctrl-C ended it early; what was done until then was kept
     refinements : what came of calibration and refinement, in that order, where they were asked for
+    resumable : an interrupted run can be continued from what its folder holds
     """
 
     folder: Path | None
@@ -69,6 +72,7 @@ class RunSummary:
     map: Any
     interrupted: bool = False
     refinements: tuple[Refinement, ...] = ()
+    resumable: bool = False
 
     @property
     def trustworthy(self) -> bool:
@@ -125,8 +129,11 @@ class _Tally:
 
 
 @dataclass(slots=True)
-class _Run:
+class _Run(Stateful):
     """A run so far. An interruption at any time leaves it whole: map and sequence are of the same camera."""
+
+    STATE: ClassVar = {"slam": Stateful, "tally": _Tally, "resumed_at": list[int]}
+    MADE = frozenset({"sequence", "config", "refinements", "interrupted"})
 
     sequence: RgbdSequence
     config: SlamConfig
@@ -134,6 +141,12 @@ class _Run:
     tally: _Tally = field(default_factory=_Tally)
     refinements: list[Refinement] = field(default_factory=list)
     interrupted: bool = False
+    resumed_at: list[int] = field(default_factory=list)  # frames that were the first after a resumption
+
+    def restored(self) -> None:
+        """Check that there are not more frames than in the sequence."""
+        if len(self.slam.results) > len(self.sequence):
+            raise ValueError("more frames than the sequence has")
 
     @property
     def tracked(self) -> bool:
@@ -174,6 +187,7 @@ class _Run:
             "warnings": [*description.get("warnings", ()), *self.tally.warnings],
             "interrupted": self.interrupted,
             "realtime": realtime,
+            **({"resumed_at": self.resumed_at} if self.resumed_at else {}),
             **({"calibrated": isinstance(self.sequence, CalibratedSequence)} if calibrate else {}),
             **({"refinements": described(self.refinements)} if self.refinements else {}),
         }
@@ -193,6 +207,8 @@ def run_sequence(
     refine: bool = False,
     realtime: bool = False,
     clock: Clock | None = None,
+    resume: bool = False,
+    checkpoint_every_s: float | None = None,
     description: Mapping[str, Any] | None = None,
     started: float | None = None,
 ) -> RunSummary:
@@ -214,6 +230,9 @@ def run_sequence(
         (:func:`~.playback.play`); by default every frame is taken, and results do not depend on timing. A live camera
         is in real time anyway
     clock : that of `realtime`; by default the machine's
+    resume : continue the run in `out` where its checkpoint is (docs/checkpoints.md), or begin where there is none
+    checkpoint_every_s : seconds between two checkpoints, by default 60 or as many as keep their cost below 2 %; 0: none
+        but when the run is interrupted. Runs in real time have none: they cannot be continued
     description : goes into run.json; its "warnings" are put before those of the run
     started : `time.perf_counter()` from which seconds_total counts; default now
 
@@ -223,9 +242,11 @@ def run_sequence(
         When `out` cannot be written; checked before any frame is read.
     DatasetError
         When no frame can be decoded.
+    FileFormatError, ConfigError
+        When the checkpoint to resume from is damaged, of another version, or of another configuration.
     InvalidInputError
-        When no given pose belongs to a frame, given poses are to be refined, or a camera is to be calibrated in real
-        time.
+        When no given pose belongs to a frame, given poses are to be refined, a camera is to be calibrated in real time,
+        or the checkpoint to resume from is of another sequence.
     """
     if isinstance(sequence, LiveSequence) and (calibrate or poses is not None):
         raise InvalidInputError(
@@ -235,10 +256,13 @@ def run_sequence(
         raise InvalidInputError("poses: given poses are not refined; leave out either poses, or refine and calibrate")
     if realtime and calibrate:
         raise InvalidInputError("calibrate: the recording is run twice for it, which is not real time; leave one out")
+    timeless = not realtime and not isinstance(sequence, LiveSequence)
+    if resume and not timeless:
+        raise InvalidInputError("resume: a run in real time cannot be continued; leave one out")
     started = time.perf_counter() if started is None else started
     config = config or SlamConfig()
     if out is not None:
-        check_writable(out, force=force)
+        check_writable(out, force=force, resume=resume)
     with Patience() as patience:
 
         def after_frame(slam: Slam, frame: Frame | None, result: FrameResult) -> None:
@@ -246,18 +270,38 @@ def run_sequence(
                 progress(result)
             for observer in observers if result.state is not FrameState.DROPPED else ():
                 observer.on_frame(slam, frame, result)
-            patience.check()  # only here: a frame is in the map and in the trajectory, or in neither
-            while not all(observer.ready(HELD_S) for observer in observers):
-                patience.check()
+            try:
+                patience.check()  # only here: a frame is in the map and in the trajectory, or in neither
+                while not all(observer.ready(HELD_S) for observer in observers):
+                    patience.check()
+            except KeyboardInterrupt:
+                keep(slam, result.index, frame, surely=run.tracked)
+                raise
+            keep(slam, result.index, frame)
+
+        def keep(slam: Slam, index: int, frame: Frame | None, *, surely: bool = False) -> None:
+            """Write a checkpoint where it is time; a second pass has none, it is made again from the first one."""
+            fault = checkpoints.keep(run, index, frame, surely=surely) if slam is run.slam else ""
+            if fault:
+                run.tally.warn(fault)
 
         given = None if poses is None else _poses_by_frame(sequence, poses)
         placed = _beside(config, out)
         run = _Run(sequence, placed, build_slam(sequence.camera, placed))
+        kept_in = out if timeless else None
+        checkpoints = Checkpoints(kept_in, sequence, config, given, every_s=checkpoint_every_s)
+        if resume and checkpoints.resume(run):
+            run.resumed_at.append(len(run.slam.results))
+            started -= checkpoints.seconds_before
+        elif resume:
+            logger.warning("%s: there is no checkpoint to resume from; the run begins at the first frame", out)
         try:
             if realtime:
                 load_kernels()
             played_by = (clock or WallClock()) if realtime else None
             _process_all(run.slam, sequence, run.tally, given, after_frame, played_by)
+            if calibrate or refine:
+                keep(run.slam, -1, None, surely=True)
             if calibrate:
                 run.calibrate(after_frame)
             if refine:
@@ -272,14 +316,16 @@ def run_sequence(
         run.check_map()
         metrics, error = summarise(run.slam, run.sequence.ground_truth, run.tally.num_points_input)
         metrics["seconds_total"] = time.perf_counter() - started
+        resumable = False
         if out is not None:
-            with write_folder(out, force=force) as aside:
+            with write_folder(out, force=force or resume) as aside:
                 write_run(
                     aside, run.slam, run.sequence, config, metrics, error, tracked_only=tracked_only, started=started,
                     description=run.describe(description or {}, calibrate=calibrate, realtime=realtime),
                 )  # fmt: skip
+                resumable = run.interrupted and checkpoints.keep_in(aside)
         results, refinements = tuple(run.slam.main_results), tuple(run.refinements)
-        return RunSummary(out, metrics, results, run.slam.map, run.interrupted, refinements)
+        return RunSummary(out, metrics, results, run.slam.map, run.interrupted, refinements, resumable)
 
 
 def _beside(config: SlamConfig, out: Path | None) -> SlamConfig:
@@ -303,7 +349,7 @@ def _process_all(
     turned = None if gyroscope is None else gyroscope.orientations(sequence.timestamps_s)
     if clock is None or isinstance(sequence, LiveSequence):
         # Two frames ahead: a prepared one of 640x480 holds 20 MB.
-        source = stream(sequence, 2, prepare=slam.prepare)
+        source = stream(sequence, 2, prepare=slam.prepare, first=len(slam.results))
     else:
         source = play(sequence, prepare=slam.prepare, clock=clock)
     with contextlib.closing(source) as records:
