@@ -17,6 +17,7 @@ from scanweld.geometry.depth import (
     luminance,
     noise_scale,
     surface_image,
+    window_radius,
 )
 
 SMALL = sw.PinholeCamera(60.0, 62.0, 30.2, 22.9, 61, 47)
@@ -53,7 +54,7 @@ def slanted_steps(seed: int, camera: sw.PinholeCamera) -> np.ndarray:
 
 def plain_surface(depth_m: np.ndarray, camera: sw.PinholeCamera, config: sw.SurfaceConfig) -> np.ndarray:
     """The surface image (H, W, 8) by its definition, in double precision: sums over the pairs of the window."""
-    depth, r = depth_m.astype(np.float64), config.normal_radius
+    depth, r = depth_m.astype(np.float64), window_radius(camera, config)
     inverse = np.divide(1, depth, out=np.zeros_like(depth), where=depth > 0)
     sigma = config.noise_floor_m + config.noise_growth * (depth - config.noise_nearest_m) ** 2
     padded = np.pad(inverse, r)
@@ -216,6 +217,11 @@ class TestSurfaces:
         without = surface[..., 6] == 0
         assert not surface[without, 3:].any()
         np.testing.assert_array_equal(surface[..., 2], depth)
+
+    @pytest.mark.parametrize(("focal_px", "expected"), [(150, 2), (525, 2), (640, 2), (920, 4), (1050, 4), (2100, 8)])
+    def test_window_of_fine_images_is_as_wide_on_the_surface(self, focal_px: float, expected: int) -> None:
+        camera = sw.PinholeCamera(focal_px, focal_px, 10, 10, 21, 21)
+        assert window_radius(camera, sw.SurfaceConfig()) == expected
 
     @pytest.mark.parametrize("shape", [(1, 1), (3, 2), (4, 5), (5, 4), (16, 3)])
     def test_images_smaller_than_the_window(self, shape: tuple[int, int]) -> None:

@@ -29,7 +29,10 @@ class SurfaceConfig:
         8.0, "the noise is scaled by what each image shows, from 1 to this; 1 trusts the numbers above", low=1.0
     )
     normal_radius: int = setting(
-        2, "window radius of the normals [pixels]; raise for noise, lower for detail", low=1, high=8
+        2,
+        "window radius of the normals [pixels; of fine images more]; raise for noise, lower for detail",
+        low=1,
+        high=8,
     )
     min_cosine: float = setting(0.15, "surfaces seen more flatly than this cosine have no normal", low=0.01, high=1.0)
     levels: int = setting(3, "pyramid levels; raise for fast motion", low=1, high=6)
@@ -143,13 +146,26 @@ def surface_image(depth_m: Float32, camera: PinholeCamera, config: SurfaceConfig
     surface = np.empty((*depth.shape, 8), np.float32)
     values = surface.reshape(len(surface), -1)
     intrinsics = intrinsics_array(camera)
-    noise, radius, cosine = config.noise, config.normal_radius, np.float32(config.min_cosine)
+    noise, radius, cosine = config.noise, window_radius(camera, config), np.float32(config.min_cosine)
 
     def rows(start: int, stop: int) -> None:
         kernels.surface_rows(start, stop, depth, intrinsics, radius, noise, cosine, values)
 
     run_ranges(depth.shape[0], rows, grain=_grain(depth))
     return surface
+
+
+USUAL_FOCAL_PX = 525.0
+"""Focal length of the usual depth camera, 640 pixels wide."""
+
+
+def window_radius(camera: PinholeCamera, config: SurfaceConfig) -> int:
+    """Return the radius of the window that normals are from [pixels]: as many as configured, or where pixels are finer
+    than usual, more.
+
+    Depth noise does not shrink with the pixels: over a window of half the width, normals scatter twice as far.
+    """
+    return max(config.normal_radius, round(config.normal_radius * max(camera.fx, camera.fy) / USUAL_FOCAL_PX))
 
 
 def half_size(depth_m: Float32, camera: PinholeCamera, relative_band: float = 0.03) -> tuple[Float32, PinholeCamera]:
