@@ -346,7 +346,7 @@ def test_a_file_named_as_another_format(tmp_path: Path) -> None:
 
 
 def test_unknown_layout_says_what_is_there(tmp_path: Path) -> None:
-    fails(tmp_path, "7scenes: .*icl: .*tum: .*redwood: .*it holds nothing")
+    fails(tmp_path, "not a sequence of a known format .*datasets list.*; it holds nothing")
     for n in range(7):
         (tmp_path / f"IMG_{n}.dng").touch()
     fails(tmp_path, r"it holds IMG_0[.]dng.* and 2 more")

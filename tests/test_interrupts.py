@@ -43,7 +43,8 @@ def test_another_handler_is_left_alone() -> None:
 
 
 def test_a_frame_is_in_map_and_trajectory_or_in_neither(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The signal comes within fusion, after the map has changed and before the frame is noted."""
+    """The signal comes within the fifth fusion, after the map has changed: before the frame is noted, or while the next
+    one is tracked."""
     fuse, count = SurfelMapper.fuse, []
 
     def fuse_and_interrupt(self: SurfelMapper, *arguments: object, **options: object) -> object:
@@ -56,10 +57,11 @@ def test_a_frame_is_in_map_and_trajectory_or_in_neither(tmp_path: Path, monkeypa
     monkeypatch.setattr(SurfelMapper, "fuse", fuse_and_interrupt)
     summary = sw.run_sequence(rendered(count=40).part(0, 12), out=tmp_path / "run")
     assert summary.interrupted
-    assert len(summary.results) == 5
+    assert len(count) in (5, 6)
+    assert len(summary.results) == len(count)
     assert summary.results[-1].num_surfels == len(summary.map)
     with (tmp_path / "run" / "frames.csv").open(encoding="utf-8") as file:
-        assert len(list(csv.DictReader(file))) == 5
+        assert len(list(csv.DictReader(file))) == len(count)
 
 
 def test_what_is_done_is_written_all_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -381,7 +381,7 @@ class TestServer:
         live.gate.pause(False)
         run.join(60)
         until(lambda: sum(len(h.points) for h in live._scene._pieces.values()) == len(done[0].map))
-        assert live._run_panel._pause.disabled
+        until(lambda: live._run_panel._pause.disabled)
         assert capsys.readouterr().out == ""
 
 

@@ -25,6 +25,7 @@ TITLES = {
     "testing": "Testing",
     "config": "Configuration",
     "parallel": "Threads",
+    "backends": "Backends",
     "errors": "Errors",
 }
 """The packages in the order of the navigation."""
