@@ -68,12 +68,7 @@ import numba  # noqa: E402  (the two variables above must be set before it loads
 kernel: Callable[[Any], Any] = numba.njit(
     fastmath=True, error_model="numpy", boundscheck=False, cache=True, nogil=True, forceinline=True
 )
-"""Decorator of compiled kernels."""
-
-outlined: Callable[[Any], Any] = numba.njit(
-    fastmath=True, error_model="numpy", boundscheck=False, cache=True, nogil=True
-)
-"""Decorator of kernels that several others call and must agree about to the last bit: they are not taken in."""
+"""Decorator of every compiled kernel."""
 
 inlined: Callable[[Any], Any] = numba.njit(
     fastmath=True, error_model="numpy", boundscheck=False, cache=True, nogil=True, inline="always"

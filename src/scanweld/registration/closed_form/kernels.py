@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from scanweld.parallel import inlined, outlined
+from scanweld.parallel import inlined, kernel
 from scanweld.registration.closed_form.linear_algebra.kernels import (
     decompose,
     handedness,
@@ -54,7 +54,7 @@ NO_ROWS.flags.writeable = False
 """Stands for "row i belongs to row i"."""
 
 
-@outlined
+@kernel
 def find_free_planes(doubt_noise, scalars, matrices):
     """Mark in FREE the planes of columns of U in which nothing holds the rotation; CURVATURES are still normalised.
 
@@ -77,7 +77,7 @@ def find_free_planes(doubt_noise, scalars, matrices):
             scalars[NUM_FREE] += free[i, j]
 
 
-@outlined
+@kernel
 def find_rotation(matrices, sign):
     """R = U diag(I, Q) V^T (Umeyama eq. 40), Q = diag(1, .., det(U V^T)) on the part that W does not determine.
 
@@ -122,7 +122,7 @@ def find_rotation(matrices, sign):
     return m
 
 
-@outlined
+@kernel
 def solve_moments(partials, kind, doubt_noise, scalars, vectors, matrices):
     """Merge rows of moments in their order, and find the motion; the ERROR is that of the moments.
 
@@ -195,7 +195,7 @@ def solve_moments(partials, kind, doubt_noise, scalars, vectors, matrices):
             vectors[TRANSLATION, i] -= scale * matrices[ROTATION, i, j] * mean
 
 
-@outlined
+@kernel
 def pair_errors(start, stop, source, target, source_rows, target_rows, weights, scalars, vectors, matrices, errors):
     """Sums of w |b - s R a - t|^2 of the chunks start..stop into errors (chunks,)."""
     d = source.shape[1]
@@ -228,7 +228,7 @@ def pair_errors(start, stop, source, target, source_rows, target_rows, weights, 
         errors[chunk] = error
 
 
-@outlined
+@kernel
 def judge_motion(errors, scalars, vectors):
     """Sum E, and see whether a reflection, of error E - 4 s sigma_D where U V^T reflects, would fit far better."""
     error = 0.0
@@ -241,7 +241,7 @@ def judge_motion(errors, scalars, vectors):
     scalars[MIRRORED] = 1.0 if mirrored else 0.0
 
 
-@outlined
+@kernel
 def turn_products(scatter, planes, turns):
     """sum w (G_k p) . (G_l p) into turns, from sum w p p^T; G_k turns axis i towards axis j, (i, j) = planes[k]."""
     for k in range(len(planes)):
@@ -267,7 +267,7 @@ def write_transform(vectors, matrices, T):
     T[d, d] = 1.0
 
 
-@outlined
+@kernel
 def describe_motion(planes, scalars, vectors, matrices, T, information, covariance):
     """T, the information of the point-to-point metric, and the covariance; about the target's origin.
 
@@ -338,7 +338,7 @@ def describe_motion(planes, scalars, vectors, matrices, T, information, covarian
                 covariance[i, j] += relative * lever_i * lever_j
 
 
-@outlined
+@kernel
 def turn_covariance(variance, scatter, spread, planes, matrices, covariance):
     """Covariance (K - D, K - D) of the rotation about the centroid: zero in the FREE planes of columns of U."""
     d = len(scatter)
@@ -378,7 +378,7 @@ def turn_covariance(variance, scatter, spread, planes, matrices, covariance):
 # --------------------------------------------------------------------------------------------- many small problems
 
 
-@outlined
+@kernel
 def align_problems(start, stop, source, target, weights, kind, doubt_noise, partials, scalars, transforms):
     """Solve the problems start..stop of (B, N, D) pairs one after another; partials (chunks, ..) is scratch."""
     d = source.shape[2]

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from scanweld.parallel import outlined
+from scanweld.parallel import kernel
 
 TINY = 1e-100  # squared length of a column, of a matrix with entries up to 1, that counts as zero
 EPSILON = 2.220446049250313e-16
 
 
-@outlined
+@kernel
 def decompose(A, left, sizes, right):
     """Write A (n, n), entries up to about 1, as left diag(sizes) right^T, sizes descending, both orthogonal.
 
@@ -65,7 +65,7 @@ def decompose(A, left, sizes, right):
             complete(left, j)
 
 
-@outlined
+@kernel
 def complete(basis, j):
     """Make column j a unit vector orthogonal to those before it: the axis that they cover least, cleared of them."""
     n = len(basis)
@@ -93,7 +93,7 @@ def complete(basis, j):
             basis[k, j] /= length
 
 
-@outlined
+@kernel
 def handedness(left, right):
     """Sign of the determinant of left right^T, both orthogonal, by elimination with pivots."""
     n = len(left)
@@ -116,7 +116,7 @@ def handedness(left, right):
     return sign
 
 
-@outlined
+@kernel
 def spread_along(scatter, axis):
     """axis^T scatter axis."""
     total = 0.0
@@ -126,7 +126,7 @@ def spread_along(scatter, axis):
     return total
 
 
-@outlined
+@kernel
 def multiply_transposed(A, B, C):
     """C = A B^T, for small matrices."""
     for i in range(A.shape[0]):
@@ -137,7 +137,7 @@ def multiply_transposed(A, B, C):
             C[i, j] = total
 
 
-@outlined
+@kernel
 def invert(A, inverse):
     """Inverse of a positive definite matrix (n, n), by Gauss-Jordan; A is used up."""
     n = len(A)

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from scanweld.parallel import outlined
+from scanweld.parallel import kernel
 
 BLOCK = 512
 CHUNK = 16384
@@ -26,7 +26,7 @@ EXPONENT = np.int64(0x7FF0000000000000)  # all of its bits are set in infinities
 NEGATIVE_ZERO = np.int64(-0x8000000000000000)
 
 
-@outlined
+@kernel
 def load_weights(first, count, source, target, source_rows, weights, w, head):
     """Weights of a block of pairs into w; 0 where one is not used. Counts them in head[:HEAD]."""
     d = source.shape[1]
@@ -60,7 +60,7 @@ def load_weights(first, count, source, target, source_rows, weights, w, head):
     head[WEIGHT] += total
 
 
-@outlined
+@kernel
 def load_points(first, count, points, rows, w, origin, x):
     """Coordinates (D, count) of a block of points, minus the origin, into x; 0 where the weight is 0."""
     if len(rows) == 0:
@@ -77,7 +77,7 @@ def load_points(first, count, points, rows, w, origin, x):
                 x[j, k] = points[np.uint64(picked[k]), j] - o if w[k] > 0 else 0.0
 
 
-@outlined
+@kernel
 def block_moments(count, x, w, y, moments):
     """Mean and second moments of x (2 D, count), weights w, into a row whose head is known; x loses its mean."""
     size = len(x)
@@ -101,7 +101,7 @@ def block_moments(count, x, w, y, moments):
             second[j, i] = total
 
 
-@outlined
+@kernel
 def merge_moments(total, part, size):
     """Add the pairs of one row of moments to another; `size` is 2 D."""
     for k in range(3):
@@ -127,7 +127,7 @@ def merge_moments(total, part, size):
             total[k] += part[k] + one * share * delta[i] * delta[j]
 
 
-@outlined
+@kernel
 def pair_moments(start, stop, source, target, source_rows, target_rows, weights, partials):
     """Moments of the chunks start..stop of the pairs into partials (chunks, 4 + 4 D + 4 D^2)."""
     d = source.shape[1]
