@@ -108,7 +108,7 @@ TYPICAL_M = 1.0
 
 SAME_VIEW_SHARE = 0.1
 """A view that moved by less than this share of the image's width shows nearly the same of the map: what has come into
-sight since is missing on one side, and twice the share has shown no loss of accuracy (docs/decisions/0015)."""
+sight since is missing on one side, and that has shown no loss of accuracy (docs/decisions/0015-pipeline.md)."""
 
 MOSTLY_NEW = 0.05
 """Where so many surfels were added, as a share of those seen, the map has to be looked at again."""

@@ -171,7 +171,8 @@ class Slam(Stateful):
         """Take one frame through the system; with a given pose (4, 4) it is fused there and not tracked.
 
         `pyramid` is what :meth:`prepare` made of the frame; without it that is done here. `orientation` is
-        R_reference_camera (3, 3) as a gyroscope has it; the reference is its own, but the same for all frames.
+        R_reference_camera (3, 3) as a gyroscope has it; the reference is its own, but the same for all frames. The
+        arrays of a frame must not change before the next call has returned: it may still be fused until then.
 
         Raises
         ------
