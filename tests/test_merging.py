@@ -44,12 +44,22 @@ def add(
     )  # fmt: skip
 
 
-def moved(surfels: SurfelMap, shift_m: float = 0.01) -> MapCorrection:
-    """The correction that has brought a map to where it is: each pass moved by so much more than the one before."""
+def merge(surfels: SurfelMap, shift_m: float = 0.01, config: MergingConfig | None = None) -> int:
+    """Move each pass by so much more than the one before, and fuse the layers that this brings together."""
+    move(surfels, shift_m)
+    return merge_doubled(surfels, 100.0, config)
+
+
+def move(surfels: SurfelMap, shift_m: float = 0.01) -> None:
+    """Move each pass to where it is, from where it would be with so much more of a shift than the one before."""
     anchors = np.unique(surfels.anchors).astype(np.int32)
     T = np.tile(np.eye(4), (len(anchors), 1, 1))
-    T[:, :3, 3] = shift_m * anchors[:, None]
-    return MapCorrection(anchors, T)
+    for sign in (-1, 1):
+        T[:, :3, 3] = sign * shift_m * anchors[:, None]
+        surfels.apply_correction(MapCorrection(anchors, T))
+        surfels.pages.follow(surfels.pages.capacity)
+        if sign < 0:
+            surfels.pages.corrections.meetings.fresh[:] = False
 
 
 class TestMergeDoubled:
@@ -59,7 +69,7 @@ class TestMergeDoubled:
         add(surfels, wall(), anchor=0, confidence=30, grey=100)
         add(surfels, wall(height=0.02, seed=1), anchor=20, confidence=10, grey=200)
         assert doubled_surfaces(surfels.positions_m.T, surfels.normals.T).share > 0.9
-        gone = merge_doubled(surfels, moved(surfels), 100.0)
+        gone = merge(surfels)
         assert gone > 0.95 * 60 * 60
         assert doubled_surfaces(surfels.positions_m.T, surfels.normals.T).share < 0.01
         assert np.median(surfels.positions_m[2]) == pytest.approx(0.005, abs=1e-3)
@@ -68,10 +78,10 @@ class TestMergeDoubled:
 
     def test_lateral_places_stay(self) -> None:
         surfels = SurfelMap()
-        kept = wall()
+        kept = wall()  # of pass 0, which does not move
         add(surfels, kept, anchor=0, confidence=30)
         add(surfels, wall(height=0.02, seed=1), anchor=20, confidence=10)
-        merge_doubled(surfels, moved(surfels), 100.0)
+        merge(surfels)
         strong = surfels.positions_m[:2, surfels.confidences >= 30]
         np.testing.assert_array_equal(strong[:, np.lexsort(strong)], kept[:2, np.lexsort(kept[:2])])
 
@@ -84,8 +94,9 @@ class TestMergeDoubled:
         surfels = SurfelMap()
         add(surfels, wall(), anchor=0)
         add(surfels, wall(height=height), anchor=anchor, normal=normal)
+        move(surfels)
         before = surfels.positions_m.copy()
-        assert merge_doubled(surfels, moved(surfels), 100.0) == 0
+        assert merge_doubled(surfels, 100.0) == 0
         np.testing.assert_array_equal(surfels.positions_m, before)
 
     def test_beside_is_not_behind(self) -> None:
@@ -93,13 +104,13 @@ class TestMergeDoubled:
         surfels = SurfelMap()
         add(surfels, wall(), anchor=0)
         add(surfels, wall() + np.array([[60 * SPACING + 0.01], [0], [0.02]], np.float32), anchor=20)
-        assert merge_doubled(surfels, moved(surfels), 100.0) == 0
+        assert merge(surfels) == 0
 
     def test_the_finer_surfels_stay(self) -> None:
         surfels = SurfelMap()
         add(surfels, wall(20, spacing=0.03), anchor=0, radius=0.0225, confidence=90)
         add(surfels, wall(height=0.01), anchor=20, confidence=10)
-        merge_doubled(surfels, moved(surfels), 100.0)
+        merge(surfels)
         assert np.count_nonzero(surfels.radii_m < 0.01) == 60 * 60
         assert np.count_nonzero(surfels.radii_m > 0.01) < 0.05 * 400
 
@@ -107,7 +118,7 @@ class TestMergeDoubled:
         surfels = SurfelMap()
         add(surfels, wall(), anchor=0, confidence=80)
         add(surfels, wall(height=0.01), anchor=20, confidence=80)
-        merge_doubled(surfels, moved(surfels), 100.0)
+        merge(surfels)
         assert surfels.confidences.max() == 100
 
     def test_what_moved_alike_stays_as_it_is(self) -> None:
@@ -115,14 +126,14 @@ class TestMergeDoubled:
         surfels = SurfelMap()
         add(surfels, wall(), anchor=0)
         add(surfels, wall(height=0.01), anchor=20)
-        assert merge_doubled(surfels, moved(surfels, 0.0), 100.0) == 0
+        assert merge(surfels, 0.0) == 0
 
     def test_off_and_empty(self) -> None:
-        assert merge_doubled(SurfelMap(), moved(SurfelMap()), 100.0) == 0
+        assert merge_doubled(SurfelMap(), 100.0) == 0
         surfels = SurfelMap()
         add(surfels, wall(), anchor=0)
         add(surfels, wall(height=0.01), anchor=20)
-        assert merge_doubled(surfels, moved(surfels), 100.0, MergingConfig(distance_m=0)) == 0
+        assert merge(surfels, config=MergingConfig(distance_m=0)) == 0
 
     def test_against_a_plain_reference(self) -> None:
         rng = np.random.default_rng(3)
@@ -137,8 +148,9 @@ class TestMergeDoubled:
                 positions, normals.astype(np.float32), rng.uniform(0, 255, (3, 300)).astype(np.float32),
                 rng.uniform(0.02, 0.05, 300).astype(np.float32), some, 0, anchor,
             )  # fmt: skip
+        move(surfels)
         expected = reference(surfels, 0.04, 0.7, 5, 100.0)
-        gone = merge_doubled(surfels, moved(surfels), 100.0)
+        gone = merge_doubled(surfels, 100.0)
         assert gone == 1500 - len(expected) > 100
         found = np.concatenate([surfels.positions_m, surfels.normals, surfels.confidences[None]]).T
         # The map keeps its surfels in an order of its own.
@@ -149,30 +161,32 @@ class TestMergeDoubled:
 
 
 def reference(surfels: SurfelMap, distance: float, cosine: float, gap: int, most: float) -> np.ndarray:
-    """The same in plain NumPy, one surfel at a time: rows of position, normal, confidence."""
+    """The same in plain NumPy, one surfel at a time, cell by cell: rows of position, normal, confidence."""
     p, n = surfels.positions_m.T.astype(float), surfels.normals.T.astype(float)
     r, w, a = surfels.radii_m.astype(float), surfels.confidences.astype(float), surfels.anchors.astype(int)
-    ranking = np.lexsort((np.arange(len(r)), -w, np.floor(np.log(r) / np.log(1.5))))
+    pages = surfels.pages
+    cells = np.repeat(pages.cells[pages.live], pages.counts[pages.live])
     alive = np.ones(len(r), bool)
-    p0, w0 = p.copy(), w.copy()
-    rank = np.empty(len(r), int)
-    rank[ranking] = np.arange(len(r))
-    for k in ranking:
-        if not alive[k]:
-            continue
-        d = p0 - p0[k]
-        h = d @ n[k]
-        lateral = (d**2).sum(axis=1) - h**2
-        eaten = alive & (rank > rank[k]) & (abs(a - a[k]) >= gap) & (abs(h) <= distance) & (n @ n[k] >= cosine)
-        eaten &= lateral <= np.maximum(r, r[k]) ** 2
-        if not eaten.any():
-            continue
-        alive &= ~eaten
-        weight = w0[k] + w0[eaten].sum()
-        p[k] = p0[k] + n[k] * (w0[eaten] @ h[eaten]) / weight
-        direction = w0[k] * n[k] + w0[eaten] @ n[eaten]
-        n[k] = direction / np.linalg.norm(direction)
-        w[k] = min(weight, most)
+    for cell in np.unique(cells):
+        ranking = np.lexsort((-w, np.floor(np.log(r) / np.log(1.5))))
+        rank = np.empty(len(r), int)
+        rank[ranking] = np.arange(len(r))
+        for k in ranking[cells[ranking] == cell]:
+            if not alive[k]:
+                continue
+            d = p - p[k]
+            h = d @ n[k]
+            lateral = (d**2).sum(axis=1) - h**2
+            eaten = alive & (rank > rank[k]) & (abs(a - a[k]) >= gap) & (abs(h) <= distance) & (n @ n[k] >= cosine)
+            eaten &= lateral <= np.maximum(r, r[k]) ** 2
+            if not eaten.any():
+                continue
+            alive &= ~eaten
+            weight = w[k] + w[eaten].sum()
+            p[k] += n[k] * (w[eaten] @ h[eaten]) / weight
+            direction = w[k] * n[k] + w[eaten] @ n[eaten]
+            n[k] = direction / np.linalg.norm(direction)
+            w[k] = min(weight, most)
     return np.concatenate([p, n, w[:, None]], axis=1)[alive]
 
 
@@ -184,5 +198,6 @@ def test_a_correction_of_the_map_fuses_what_it_brings_together() -> None:
     T = np.eye(4)
     T[2, 3] = -0.19
     mapper.apply(MapCorrection(np.array([20], np.int32), T[None]))
+    mapper.finish()
     assert len(mapper.map) < 1.05 * 60 * 60
     assert np.median(mapper.map.positions_m[2]) == pytest.approx(0.005, abs=1e-3)

@@ -210,7 +210,8 @@ class TestSameBytes:
                 positions[2], normals[:] = 0.01 * anchor - 0.01 * (anchor > 0), [[0], [0], [1]]
                 surfels.append(positions, normals, colors, np.full(4000, 0.3, np.float32), confidences, 0, anchor)
             surfels.apply_correction(correction)
-            gone.append(merge_doubled(surfels, correction, 100.0))
+            surfels.pages.follow(surfels.pages.capacity)
+            gone.append(merge_doubled(surfels, 100.0))
         assert gone[0] == gone[1] > 2000
         assert len(plain) == len(paged) == 8000 - gone[0]
         assert content(plain) == content(paged)
@@ -292,6 +293,7 @@ def test_pages_that_a_correction_moved_are_filled_on() -> None:
     T = np.eye(4)
     T[0, 3] = 1.0
     surfels.apply_correction(sw.MapCorrection(np.array([0], np.int32), T[None]))
+    surfels.pages.follow(surfels.pages.capacity)
     surfels.append(
         positions[:, :10] + np.float32([[1], [0], [0]]), ones[:, :10], ones[:, :10], ones[0, :10], ones[0, :10], 1
     )

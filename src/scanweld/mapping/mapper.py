@@ -55,6 +55,7 @@ class SurfelMapper(Stateful):
         New surfels move with `keyframe`.
         """
         self.map.anchor = keyframe
+        self._follow_up()
         level = pyramid.levels[0]
         self._reach_m = max(self._reach_m, FURTHER * float(level.depth_m.max(initial=0.0)))
         candidates = find_candidates(self.map, T_world_camera, level.camera, far_m=self._reach_m)
@@ -66,9 +67,13 @@ class SurfelMapper(Stateful):
         return counts
 
     def apply(self, correction: MapCorrection) -> None:
-        """Move surfels with their keyframes, and fuse the layers that this brings together."""
+        """Move surfels with their keyframes; those out of view, and layers that this brings together, follow later."""
         self.map.apply_correction(correction)
-        self._merge(correction)
+        self.last_seen = None
+
+    def finish(self) -> None:
+        """Do at once what was put off: after the last frame, or before the whole map is looked at."""
+        self._follow_up(everything=True)
 
     def fresh(self) -> SurfelMapper:
         """Return a mapper like this one with an empty map; its frames are numbered on from those of this one."""
@@ -82,11 +87,14 @@ class SurfelMapper(Stateful):
         self.map.take_in(other.map)
         self._frames_fused = max(self._frames_fused, other._frames_fused)
         self._reach_m = max(self._reach_m, other._reach_m)
-        self._merge(correction)
-
-    def _merge(self, correction: MapCorrection) -> None:
-        merge_doubled(self.map, correction, self.config.max_confidence, self.config.merging)
         self.last_seen = None
+
+    def _follow_up(self, everything: bool = False) -> None:
+        """Let some of the map follow the last corrections, or all of it, and fuse layers that this brings together."""
+        pages = self.map.pages
+        pages.follow(pages.capacity if everything else PAGES_A_FRAME)
+        at_most = 0 if everything else PAGES_A_FRAME
+        merge_doubled(self.map, self.config.max_confidence, self.config.merging, at_most=at_most)
 
 
 def shows_the_same(view: ModelView, T_world_camera: Float64, camera: PinholeCamera) -> bool:
@@ -109,6 +117,9 @@ TYPICAL_M = 1.0
 SAME_VIEW_SHARE = 0.1
 """A view that moved by less than this share of the image's width shows nearly the same of the map: what has come into
 sight since is missing on one side, and that has shown no loss of accuracy (docs/decisions/0015-pipeline.md)."""
+
+PAGES_A_FRAME = 32
+"""Pages that follow a correction with each frame though they are out of view, and that are looked at for layers."""
 
 MOSTLY_NEW = 0.05
 """Where so many surfels were added, as a share of those seen, the map has to be looked at again."""

@@ -83,9 +83,13 @@ class PipelinedMapper(Stateful):
             self._fusing = in_background(fuse)
 
     def apply(self, correction: MapCorrection) -> None:
-        """Move the map with its keyframes."""
+        """Move the map with its keyframes, see :meth:`SurfelMapper.apply`."""
         self._seen = None
         self.settled.apply(correction)
+
+    def finish(self) -> None:
+        """Do at once what was put off."""
+        self.settled.finish()
 
     def fresh(self) -> PipelinedMapper:
         """Return a mapper like this one with an empty map."""

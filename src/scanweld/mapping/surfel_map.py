@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from functools import partial
 from typing import ClassVar
 
 import numpy as np
@@ -14,7 +13,6 @@ from scanweld.geometry.views import MapCorrection
 from scanweld.mapping.storage.kernels import PAGE, ROWS
 from scanweld.mapping.storage.pages import MapConfig, PagePool
 from scanweld.notebook import card, seen_from_above
-from scanweld.parallel import run_ranges
 from scanweld.state import Stateful
 
 _ROWS: dict[str, tuple[slice, type]] = {
@@ -171,8 +169,7 @@ class SurfelMap(Stateful):
 
     def take_in(self, other: SurfelMap) -> None:
         """Add the surfels of another map in the same world, as they are: their keyframes and ages stay theirs."""
-        for slots in other.pages.batches():
-            self.pages.add(other.pages.rows_in(slots))
+        self.pages.take_in(other.pages)
 
     def remove(self, doomed: Bool) -> int:
         """Drop the surfels where `doomed` (N,) is true; returns how many went."""
@@ -197,18 +194,8 @@ class SurfelMap(Stateful):
         return np.asarray(first[numbers // PAGE] + numbers % PAGE)
 
     def apply_correction(self, correction: MapCorrection) -> None:
-        """Move the surfels of each named keyframe by its T_new_old."""
-        pages, table = self.pages, motions(correction)
-        moves = (table != np.eye(4)).any(axis=(1, 2))
-        changed = [np.empty(0, np.int64)]
-        for slots in pages.batches():
-            moved: Bool = np.zeros(len(slots), np.bool_)
-            run_ranges(
-                len(slots), partial(_move_pages, pages=pages, slots=slots, table=table, moves=moves, moved=moved)
-            )
-            changed.append(slots[moved])
-            pages.fit_boxes(changed[-1])
-        pages.settle(np.concatenate(changed))
+        """Move the surfels of each named keyframe by its T_new_old; each page follows when it is next looked at."""
+        self.pages.correct(motions(correction))
 
     def _add(self, table: Mapping[str, Array]) -> None:
         """Add surfels that come with all their columns."""
@@ -231,25 +218,10 @@ class SurfelMap(Stateful):
 
 
 def motions(correction: MapCorrection) -> Float64:
-    """Return T_new_old (A + 1, 4, 4) of each keyframe by its number; the last is for all those that stay."""
+    """Return T_new_old (A + 1, 4, 4) of each keyframe by its number; the last, the identity, is for all others."""
     table = np.tile(np.eye(4), (int(correction.keyframe_ids.max(initial=0)) + 2, 1, 1))
     table[correction.keyframe_ids] = correction.T_new_old
     return table
-
-
-def _move_pages(start: int, stop: int, pages: PagePool, slots: Int64, table: Float64, moves: Bool, moved: Bool) -> None:
-    """Move the surfels of pages slots[start:stop] by the table of :func:`motions`, and note in `moved` which had any.
-
-    `moves` (A + 1,) : whether a keyframe moves at all
-    """
-    for k, slot in enumerate(slots[start:stop].tolist(), start):
-        rows = pages.page(slot)
-        anchors = np.minimum(rows[13].view(np.int32), len(table) - 1)
-        if not moves[anchors].any():
-            continue
-        moved[k], T = True, table[anchors]
-        rows[0:3] = np.einsum("nij,jn->in", T[:, :3, :3], rows[0:3]) + T[:, :3, 3].T
-        rows[3:6] = np.einsum("nij,jn->in", T[:, :3, :3], rows[3:6])
 
 
 def _file_columns(rows: Float32) -> dict[str, Array]:

@@ -43,6 +43,15 @@ class Mapper(Protocol):
 
 
 @runtime_checkable
+class DeferringMapper(Mapper, Protocol):
+    """A mapper that puts work off, so that no frame has to wait for it."""
+
+    def finish(self) -> None:
+        """Do at once what was put off; asked for before anybody takes the whole map."""
+        ...
+
+
+@runtime_checkable
 class SubmapMapper(Mapper, Protocol):
     """A mapper that can begin another map and take it in later; without it a lost camera begins no submap."""
 

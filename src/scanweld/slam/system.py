@@ -31,7 +31,7 @@ from scanweld.registration.result import RegistrationResult, Status
 from scanweld.slam.health import HealthConfig, TrackingHealth, is_near
 from scanweld.slam.motion import POSED, UNSEEN, ConstantVelocity, trajectory_of
 from scanweld.slam.rotation_aid import RotationAid, as_rotation
-from scanweld.slam.stages import LoopCloser, Mapper, Tracker
+from scanweld.slam.stages import DeferringMapper, LoopCloser, Mapper, Tracker
 from scanweld.slam.submaps import Atlas, SubmapConfig, in_one_world, main_submap
 from scanweld.state import Stateful
 from scanweld.tracking.dynamics import DynamicsConfig, MotionDetector, leave_out, track_static
@@ -124,12 +124,18 @@ class Slam(Stateful):
 
     @property
     def map(self) -> Any:
-        """The map of the main submap; to be asked for anew after each frame, which may still be fused into it."""
+        """The map of the main submap; to be asked for anew after each frame, which may still be fused into it.
+
+        What mappers put off after a closed loop is done first; until the last frame `mapper.map` goes without.
+        """
         return self.maps[main_submap(self._results)]
 
     @property
     def maps(self) -> dict[int, Any]:
-        """The map of each submap, by its number in the results."""
+        """The map of each submap, by its number in the results; see `map`."""
+        for mapper in self.atlas.mappers.values():
+            if isinstance(mapper, DeferringMapper):
+                mapper.finish()
         return {submap: mapper.map for submap, mapper in self.atlas.mappers.items()}
 
     @property

@@ -1,7 +1,8 @@
 """Surfaces that two passes left as two layers are fused again, once a correction has brought the layers together.
 
 What faces the same way and lies within a few centimetres along the normal, exactly before or behind, is one surface:
-nobody has seen a surface through another one.
+nobody has seen a surface through another one. Pages follow a correction when they are next looked at
+(:mod:`~scanweld.mapping.storage.corrections`); so layers, too, are fused cell by cell, some with each frame.
 """
 
 from __future__ import annotations
@@ -10,18 +11,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from scanweld.arrays import Array, Bool, Float32, Float64, Int64
+from scanweld.arrays import Bool, Float32, Int64
 from scanweld.config import check_ranges, setting
-from scanweld.geometry import se3
-from scanweld.geometry.views import MapCorrection
 from scanweld.mapping.merging import kernels
-from scanweld.mapping.surfel_map import SurfelMap, motions
+from scanweld.mapping.storage.pages import PagePool
+from scanweld.mapping.surfel_map import SurfelMap
 
 _COSINE = 0.7
 _RADIUS_CLASS = 1.5  # surfels within this factor are equally fine; Keller et al. 2013 refine by the same factor
-_BITS = 21  # of a cell's number along an axis
-_AREA_M = 0.25  # cells in which surfels that moved in different ways are looked for
 _MOVED_M = 0.002  # apart: less than this and the layers lie as they lay before
+_SIDE_M = 0.015  # of the small cells in which a surfel looks for others
+_MOST_SIDES = 64  # of these in a row
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -40,117 +40,83 @@ class MergingConfig:
         check_ranges(self)
 
 
-def merge_doubled(
-    surfels: SurfelMap, correction: MapCorrection, most: float, config: MergingConfig | None = None
-) -> int:
-    """Fuse the layers that different passes left of a surface; the map is changed, returns how many surfels went.
+def merge_doubled(surfels: SurfelMap, most: float, config: MergingConfig | None = None, *, at_most: int = 0) -> int:
+    """Fuse layers of different passes where corrections brought them together; returns how many surfels went.
 
-    The finer surfels of the two layers stay, moved along their normals to the mean that the confidences weigh.
+    The finer surfels of two layers stay, moved along their normals to the mean that the confidences weigh. Only cells
+    are looked at of which pages have followed a correction, and where these did not all move alike.
 
     Parameters
     ----------
-    surfels : the map, after the correction
-    correction : what it was moved by; where all moved alike nothing is looked for
+    surfels : the map, which is changed
     most : largest confidence of a surfel
     config : when layers are one surface
+    at_most : end with the cell that makes so many pages looked at, the other cells are for the next call; 0: do all
     """
     config = config or MergingConfig()
-    if config.distance_m == 0:
+    meetings = surfels.pages.corrections.meetings
+    if config.distance_m == 0 or not meetings.fresh.any():
         return 0
-    pages, numbers = surfels.pages, _brought_together(surfels, correction, config.gap)
-    if len(numbers) == 0:
-        return 0
-    rows = pages.rows(numbers)
-    side = max(config.distance_m, float(rows[7].max()))
-    keys = _cells(rows[:3].astype(np.float64), side)
-    order = np.argsort(keys, kind="stable")
-    numbers, keys, rows = numbers[order], keys[order], rows[:, order]
-    begins = np.diff(keys, prepend=-1) != 0
-    cells, cell_of = keys[begins], np.cumsum(begins) - 1
+    looked_at, gone = 0, 0
+    while len(cells := meetings.among(config.gap, _MOVED_M)):
+        for cell in cells.tolist():
+            meetings.list(cell)  # before: pages around it may follow only now, into this cell or another
+            num, fewer = _merge_cell(surfels.pages, cell, most, config)
+            looked_at, gone = looked_at + num, gone + fewer
+            if 0 < at_most <= looked_at:
+                return gone
+    return gone
+
+
+def _merge_cell(pages: PagePool, cell: int, most: float, config: MergingConfig) -> tuple[int, int]:
+    """Let the surfels of a cell take in others, also of cells around it; returns the pages looked at, and who went."""
+    mine = np.flatnonzero(pages.cells == cell)
+    if len(mine) == 0:
+        return 0, 0
+    pages.use(mine)
+    own, rows = pages.numbers_in(mine), pages.rows_in(mine)
+    count, reach = len(own), np.float32(config.distance_m + rows[7].max())
+    slots, others, around = _within(pages, mine, rows[0:3].min(axis=1) - reach, rows[0:3].max(axis=1) + reach)
+    numbers, rows = np.concatenate([own, others]), np.concatenate([rows, around], axis=1)
     p, n, c, r, weights = rows[0:3], rows[3:6], rows[8:11], rows[7], rows[6]
     fineness = np.floor(np.log(np.maximum(r, 1e-6)) / np.log(_RADIUS_CLASS))
     ranking = np.lexsort((-weights, fineness)).astype(np.int64)
-    rank = np.empty_like(ranking)
-    rank[ranking] = np.arange(len(ranking))
+    place = np.empty_like(ranking)
+    place[ranking] = np.arange(len(ranking))
+    origin = p.min(axis=1)
+    side = np.float32(max(_SIDE_M, float((p.max(axis=1) - origin).max()) / _MOST_SIDES))
+    starts, members, lattice = _by_cells(p - origin[:, None], side)
+    changed: Bool = np.zeros(len(numbers), np.bool_)
     taken: Bool = np.zeros(len(numbers), np.bool_)
-    limits = np.array([config.distance_m, _COSINE, most], np.float32)
+    limits = np.array([config.distance_m, _COSINE, most, r.max()], np.float32)
     kernels.merge_layers(
-        ranking, rank, cell_of, _around(cells, keys), p, n, c, r, weights,
-        rows[13].view(np.int32), config.gap, limits, taken,
+        ranking[ranking < count], place, starts, members, lattice, origin, p, n, c, r, weights, rows[13].view(np.int32),
+        config.gap, limits, side, changed, taken,
     )  # fmt: skip
-    slots = pages.slots_of(numbers)
-    pages.use(slots)
-    pages.put(numbers, rows)
-    pages.fit_boxes(slots)
-    pages.settle(slots)
+    pages.put(numbers[changed], rows[:, changed])
+    pages.fit_boxes(mine)
     pages.drop(numbers[taken])
-    return int(np.count_nonzero(taken))
+    return len(mine) + len(slots), int(np.count_nonzero(taken))
 
 
-def _brought_together(surfels: SurfelMap, correction: MapCorrection, gap: int) -> Int64:
-    """Return the numbers of the surfels in areas that more than one pass saw, and that moved in different ways."""
-    pages, T_old_new = surfels.pages, se3.inverse(motions(correction))
-
-    # Of each area (A,), from all batches: its key, and the least and the largest anchor and motion (4, A) there.
-    found: tuple[Int64, Float64, Float64] = np.empty(0, np.int64), np.empty((4, 0)), np.empty((4, 0))
-    for slots in pages.batches():
-        positions, anchors = pages.rows_in(slots, slice(0, 3)), pages.rows_in(slots, slice(13, 14))[0].view(np.int32)
-        T = T_old_new[np.minimum(anchors, len(T_old_new) - 1)]
-        moved = positions - np.einsum("nij,jn->in", T[:, :3, :3], positions) - T[:, :3, 3].T
-        values = np.concatenate([anchors[None], moved])
-        keys, least, largest = _by_area(_areas(positions), values, values)
-        found = _by_area(
-            np.concatenate([found[0], keys]),
-            np.concatenate([found[1], least], axis=1),
-            np.concatenate([found[2], largest], axis=1),
-        )
-    areas, least, largest = found
-    apart = (largest - least)[1:].max(axis=0, initial=0.0)
-    areas = areas[((largest - least)[0] >= gap) & (apart > _MOVED_M)]
-    chosen = [np.empty(0, np.int64)]
-    for slots in pages.batches() if len(areas) else ():
-        keys = _areas(pages.rows_in(slots, slice(0, 3)))
-        near = np.minimum(np.searchsorted(areas, keys), len(areas) - 1)
-        chosen.append(pages.numbers_in(slots)[areas[near] == keys])
-    return np.concatenate(chosen)
+def _within(pages: PagePool, mine: Int64, low: Float32, high: Float32) -> tuple[Int64, Int64, Float32]:
+    """Return other pages than `mine` and their surfels between two corners: numbers (N,), rows (ROWS, N)."""
+    faces = np.concatenate([np.eye(3), -np.eye(3)])
+    slots = np.setdiff1d(pages.cull(np.column_stack([faces, np.concatenate([-low, high])])), mine)
+    pages.use(slots)
+    numbers, rows = pages.numbers_in(slots), pages.rows_in(slots)
+    inside = ((rows[0:3] >= low[:, None]) & (rows[0:3] <= high[:, None])).all(axis=0)
+    return slots, numbers[inside], rows[:, inside]
 
 
-def _by_area(keys: Int64, least: Float64, largest: Float64) -> tuple[Int64, Float64, Float64]:
-    """Return each key once, with the least of the least values (R, N) and the largest of the largest."""
-    order = np.argsort(keys, kind="stable")
-    keys = keys[order]
-    first = np.flatnonzero(np.diff(keys, prepend=-1))
-    if len(first) == 0:
-        return keys, least, largest
-    return (
-        keys[first],
-        np.minimum.reduceat(least[:, order], first, axis=1),
-        np.maximum.reduceat(largest[:, order], first, axis=1),
-    )
+def _by_cells(positions_m: Float32, side_m: np.float32) -> tuple[Int64, Int64, Int64]:
+    """Sort positions (3, M), none of them negative, into the cells of a lattice.
 
-
-def _areas(positions_m: Float32) -> Int64:
-    """Return the key of the area of each position (3, N), the same in every batch."""
-    lattice = np.floor(positions_m.astype(np.float64) / _AREA_M).astype(np.int64) + (1 << _BITS - 1)
-    return np.asarray(lattice[0] | lattice[1] << _BITS | lattice[2] << 2 * _BITS)
-
-
-def _cells(positions_m: Float64, side_m: float) -> Int64:
-    """Return the number of each position's (3, N) cell; neighbours along x have neighbouring numbers."""
-    lattice = np.floor(positions_m / side_m).astype(np.int64)
-    lattice -= lattice.min(axis=1, keepdims=True) - 1
-    lattice = np.minimum(lattice, (1 << _BITS) - 2)
-    return np.asarray(lattice[0] | lattice[1] << _BITS | lattice[2] << 2 * _BITS)
-
-
-def _around(cells: Int64, keys: Int64) -> Int64:
-    """Return the places (C, 9, 2) in the sorted `keys` (M,) of the nine rows of three cells around each cell."""
-    ranges: Array = np.empty((len(cells), 9, 2), np.int64)
-    row = 0
-    for dz in (-1, 0, 1):
-        for dy in (-1, 0, 1):
-            middle = cells + (dy << _BITS) + (dz << 2 * _BITS)
-            ranges[:, row, 0] = np.searchsorted(keys, middle - 1, side="left")
-            ranges[:, row, 1] = np.searchsorted(keys, middle + 1, side="right")
-            row += 1
-    return ranges
+    Returns where the members of each cell start (cells + 1,), the members (M,), and the cells along each axis (3,).
+    """
+    indices = (positions_m / side_m).astype(np.int64)
+    lattice = indices.max(axis=1) + 1
+    flat = (indices[0] * lattice[1] + indices[1]) * lattice[2] + indices[2]
+    starts = np.zeros(int(lattice.prod()) + 1, np.int64)
+    np.cumsum(np.bincount(flat, minlength=len(starts) - 1), out=starts[1:])
+    return starts, np.argsort(flat, kind="stable"), lattice

@@ -213,3 +213,35 @@ def clean_pages(start, stop, slots, frame_id, unstable_frames, stable, pool, who
                     whole[base + row * np.uint64(STRIDE) + kept] = whole[base + row * np.uint64(STRIDE) + k]
             kept += np.uint64(1)
         counts[slot], probation[slot] = kept, earliest
+
+
+@kernel
+def move_pages(start, stop, slots, epochs, tables, counts, pool, whole, least, largest):
+    """Let pages slots[start:stop] follow the corrections that they have not followed yet.
+
+    epochs (P,) int32: how many corrections each page has followed; tables (E, A + 1, 12) float64: the upper rows of
+    T_now_then of each keyframe for the pages of each epoch, the last for all other keyframes. least, largest (4, S)
+    float64 are written: the range of the anchors, and of the motion [m], of each page's surfels.
+    """
+    others = tables.shape[1] - 1
+    for s in range(start, stop):
+        slot = slots[s]
+        base, table = np.uint64(slot) * np.uint64(SPAN), tables[epochs[slot]]
+        for k in range(4):
+            least[k, s], largest[k, s] = 1e9, -1e9
+        for k in range(np.uint64(counts[slot])):
+            anchor = whole[base + ANCHOR + k]
+            T = table[min(anchor, others)]
+            x, y, z = np.float64(pool[base + k]), np.float64(pool[base + Y + k]), np.float64(pool[base + Z + k])
+            pool[base + k] = T[0] * x + T[1] * y + T[2] * z + T[3]
+            pool[base + Y + k] = T[4] * x + T[5] * y + T[6] * z + T[7]
+            pool[base + Z + k] = T[8] * x + T[9] * y + T[10] * z + T[11]
+            moved = (pool[base + k] - x, pool[base + Y + k] - y, pool[base + Z + k] - z)
+            least[0, s], largest[0, s] = min(least[0, s], anchor), max(largest[0, s], anchor)
+            for axis in range(3):
+                least[1 + axis, s] = min(least[1 + axis, s], moved[axis])
+                largest[1 + axis, s] = max(largest[1 + axis, s], moved[axis])
+            x, y, z = np.float64(pool[base + NX + k]), np.float64(pool[base + NY + k]), np.float64(pool[base + NZ + k])
+            pool[base + NX + k] = T[0] * x + T[1] * y + T[2] * z
+            pool[base + NY + k] = T[4] * x + T[5] * y + T[6] * z
+            pool[base + NZ + k] = T[8] * x + T[9] * y + T[10] * z

@@ -14,6 +14,7 @@ from scanweld.config import check_ranges, setting
 from scanweld.errors import InvalidInputError
 from scanweld.mapping.storage import kernels
 from scanweld.mapping.storage.backing import MappedFile, Memory
+from scanweld.mapping.storage.corrections import Corrections, farthest_moves
 from scanweld.mapping.storage.kernels import PAGE, ROWS, SHELF, SPAN, STRIDE
 from scanweld.mapping.storage.residence import Residence
 from scanweld.parallel import run_ranges
@@ -45,6 +46,7 @@ MOST_PAGES = 0x7FFFFFFF // PAGE
 """The number of a surfel is an int32."""
 
 _PER_CELL = np.float32(1 / CELL_M)
+_OUTWARD = np.repeat(np.array([-1, 1], np.float32), 3)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -70,8 +72,8 @@ class PagePool(Stateful):
     """Pages in one array that grows when it is full, and a hash table of the cells that they lie in.
 
     With a memory budget the array is a file, of which the shelves that were used last are in memory. A shelf is used by
-    naming its pages: `inside`, `use` and `batches` do; kernels may read any page at any time, but one that was not
-    named is not counted.
+    naming its pages: `inside`, `use` and `batches` do. Kernels may read any page at any time, but one that was not
+    named is not counted, and may lie where it lay before the last corrections.
 
     Attributes
     ----------
@@ -82,12 +84,15 @@ class PagePool(Stateful):
     cells : (capacity,) int64, key of the cell that each page fills
     probation : (capacity,) int32, first frame of what may be unstable in each page
     dirty : (capacity,) uint8, pages with a surfel that lost confidence
+    epochs : (capacity,) int32, corrections that each page has followed
+    corrections : what pages of earlier epochs have still to follow
     total : surfels of all pages
     """
 
     STATE: ClassVar = {
         "counts": Int32, "boxes": Float32, "shelves": Float32, "cells": Int64, "probation": Int32, "dirty": UInt8,
-        "total": int, "_looks": int, "_waiting": dict[int, list[Int32]], "_keys": Int64, "_tails": Int32,
+        "epochs": Int32, "corrections": Stateful, "_behind": int, "total": int, "_looks": int,
+        "_waiting": dict[int, list[Int32]], "_keys": Int64, "_tails": Int32,
         "_room": int, "free": Int32, "contents": Iterator[Float32],
     }  # fmt: skip
     MADE = frozenset({"config", "_backing", "_residence", "pool", "_free", "_num_free"})
@@ -99,6 +104,8 @@ class PagePool(Stateful):
         self._backing = MappedFile(self.config.folder) if budget > 0 else Memory()
         self._residence = Residence(self._backing, SHELF * SPAN, int(budget * 1e6 / 4))
         self._looks = 0
+        self.corrections = Corrections()
+        self._behind = 0  # pages below this slot have followed all corrections
         self._waiting: dict[int, list[Int32]] = {}
         self._keys: Int64 = np.full(FEWEST_CELLS, -1, np.int64)
         self._tails: Int32 = np.full(FEWEST_CELLS, -1, np.int32)
@@ -116,6 +123,7 @@ class PagePool(Stateful):
     cells: Int64
     probation: Int32
     dirty: UInt8
+    epochs: Int32
 
     @property
     def whole(self) -> Int32:
@@ -144,8 +152,9 @@ class PagePool(Stateful):
 
     @property
     def contents(self) -> Iterator[Float32]:
-        """The surfels (ROWS, N) of all pages, part by part."""
-        for slots in self.batches():
+        """The surfels (ROWS, N) of all pages, part by part, each where it is by its epoch."""
+        for slots in self._batches(self.live):
+            self._recall(slots)
             for start in range(0, len(slots), PART):
                 yield self.rows_in(slots[start : start + PART])
 
@@ -161,7 +170,7 @@ class PagePool(Stateful):
             num = int(np.searchsorted(ends, rows.shape[-1], side="right"))
             if rows.shape != (ROWS, ends[num - 1] if num else -1):
                 raise ValueError("a part of a page")
-            self.use(slots[:num])
+            self._recall(slots[:num])
             for slot, page in zip(slots[:num].tolist(), np.split(rows, ends[: num - 1], axis=1), strict=True):
                 self.page(slot)[:] = page
             slots = slots[num:]
@@ -174,6 +183,9 @@ class PagePool(Stateful):
         right = right and bool((self.counts >= 0).all() and (self.counts <= PAGE).all())
         if not right or self.counts.sum(dtype=np.int64) != self.total or self.capacity > MOST_PAGES:
             raise ValueError("pages of other sizes")
+        epochs = self.epochs[self.live]
+        if epochs.min(initial=0) < 0 or epochs.max(initial=0) > len(self.corrections):
+            raise ValueError("pages of epochs that there are not")
         empty = np.flatnonzero(self.counts == 0)
         if not np.array_equal(np.sort(self.free), empty):
             raise ValueError("free pages that are not free")
@@ -203,7 +215,17 @@ class PagePool(Stateful):
         return self.pool.reshape(-1, ROWS, STRIDE)[slot, :, : self.counts[slot]]
 
     def use(self, slots: Array) -> None:
-        """Have pages in memory; others go where the budget asks for it, those first that were used longest ago."""
+        """Have pages in memory, where corrections have taken them.
+
+        Others leave memory where the budget asks for it, those first that were used longest ago.
+        """
+        self._recall(slots)
+        late = slots[self.epochs[slots] < len(self.corrections)]
+        if len(late):
+            self._follow(late.astype(np.int64))
+
+    def _recall(self, slots: Array) -> None:
+        """Have pages in memory, wherever they lie."""
         if self._backing.paged:
             self._residence.use(np.unique(slots // SHELF))
 
@@ -212,15 +234,18 @@ class PagePool(Stateful):
 
         The pages of a part are in memory while it is looked at.
         """
-        slots = self.live if slots is None else slots
+        for some in self._batches(self.live if slots is None else slots):
+            self.use(some)
+            yield some
+
+    def _batches(self, slots: Array) -> Iterator[Array]:
+        """Yield slots in parts of which four fit the budget."""
         if len(slots) == 0:
             return
         shelf = np.cumsum(np.diff(slots // SHELF, prepend=slots[0] // SHELF) != 0)
         size = min(BATCH_SHELVES, self._residence.room // 4) if self._backing.paged else BATCH_SHELVES
         part = shelf // max(1, size)
-        for some in np.split(slots, np.flatnonzero(np.diff(part)) + 1):
-            self.use(some)
-            yield some
+        yield from np.split(slots, np.flatnonzero(np.diff(part)) + 1)
 
     def numbers_in(self, slots: Array) -> Int64:
         """Return the numbers (N,) of the surfels of pages, page by page."""
@@ -268,6 +293,7 @@ class PagePool(Stateful):
         self.total += total
         if total:
             touched = np.unique(numbers // PAGE)
+            self.epochs[touched] = len(self.corrections)  # pages that have still to move take nothing in
             self.use(touched)
             first = int(rows[11].view(np.int32).min())
             self.probation[touched] = np.minimum(self.probation[touched], first)
@@ -353,6 +379,63 @@ class PagePool(Stateful):
         np.minimum.at(self.shelves[:, :3], slots // SHELF, self.boxes[slots, :3])
         np.maximum.at(self.shelves[:, 3:], slots // SHELF, self.boxes[slots, 3:])
 
+    def correct(self, T_new_old: Float64) -> None:
+        """Let pages follow a correction (A + 1, 4, 4), see :class:`Corrections`, each when it is next used.
+
+        Until then its box is as wide as to hold it wherever it may come to.
+        """
+        live = self.live
+        done = int(self.epochs[live].min(initial=len(self.corrections)))
+        self.epochs[live] -= done
+        self.corrections.forget(done)
+        self.corrections.add(T_new_old)
+        self._behind = 0
+        reach_m = np.zeros(len(self.shelves), np.float32)
+        filled = self.shelves[:, 0] <= self.shelves[:, 3]
+        reach_m[filled] = np.nextafter(farthest_moves(T_new_old, self.shelves[filled]), np.inf, dtype=np.float32)
+        self.shelves += reach_m[:, None] * _OUTWARD
+        self.boxes[live] += reach_m[live // SHELF, None] * _OUTWARD
+        self.cells[live] = -1  # what is new belongs to other pages than those that have not moved yet
+
+    def follow(self, slots: int) -> None:
+        """Let a few more pages, those of so many slots, follow all corrections though nobody uses them."""
+        if self._behind < self.capacity and len(self.corrections):
+            some = np.arange(self._behind, min(self._behind + slots, self.capacity))
+            self._behind += len(some)
+            some = some[(self.counts[some] > 0) & (self.epochs[some] < len(self.corrections))]
+            for _ in self.batches(some):
+                pass  # they are used
+
+    def take_in(self, other: PagePool) -> None:
+        """Add the surfels of another storage; they meet those here in the way in which they were moved last."""
+        other.follow(other.capacity)
+        met = other.corrections.meetings
+        for slots in self.batches(np.flatnonzero((self.counts > 0) & np.isin(self.cells, met.cells))):
+            anchors = self.rows_in(slots, slice(13, 14))[0].view(np.int32)
+            first = np.cumsum(self.counts[slots]) - self.counts[slots]
+            stayed = np.zeros((2, 4, len(slots)))
+            stayed[:, 0] = np.minimum.reduceat(anchors, first), np.maximum.reduceat(anchors, first)
+            self.corrections.meetings.add(self.cells[slots], stayed[0], stayed[1])
+        self.corrections.meetings.add(met.cells, met.least, met.largest)
+        for slots in other.batches():
+            self.add(other.rows_in(slots))
+
+    def _follow(self, slots: Int64) -> None:
+        """Move pages that have corrections to follow."""
+        tables = self.corrections.tables[:, :, :3].reshape(len(self.corrections), -1, 12)
+        whole, ranges = self.whole, np.empty((2, 4, len(slots)))
+
+        def body(start: int, stop: int) -> None:
+            kernels.move_pages(
+                start, stop, slots, self.epochs, tables, self.counts, self.pool, whole, ranges[0], ranges[1]
+            )
+
+        run_ranges(len(slots), body, grain=16)
+        self.epochs[slots] = len(self.corrections)
+        self.fit_boxes(slots)
+        self.settle(slots)
+        self.corrections.meetings.add(self.cells[slots], ranges[0], ranges[1])
+
     def settle(self, slots: Int64) -> None:
         """Let pages that were moved, all at once, be those of the cells that their boxes have come to."""
         self.cells[slots] = -1
@@ -413,4 +496,5 @@ def _columns(capacity: int) -> dict[str, Array]:
         "counts": np.zeros(capacity, np.int32), "boxes": np.zeros((capacity, 6), np.float32), "shelves": boxes,
         "cells": np.full(capacity, -1, np.int64), "probation": np.zeros(capacity, np.int32),
         "dirty": np.zeros(capacity, np.uint8),
+        "epochs": np.zeros(capacity, np.int32),
     }  # fmt: skip
