@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import subprocess
 import sys
 from pathlib import Path
 
@@ -182,6 +183,24 @@ class TestWarmup:
             monkeypatch.setattr(sys, "executable", absent)
             with warmup._beside("pass") as wait:
                 wait()
+
+    def test_what_only_a_long_run_calls_is_compiled_too(self) -> None:
+        """In a process of its own, as nothing else may have called these kernels."""
+        code = """
+from scanweld.slam import warmup
+warmup.compile_pairs()
+warmup._compile_frames(print, print)
+from scanweld.loop_closure import kernels as places
+from scanweld.mapping import kernels as mapping
+from scanweld.mapping.merging import kernels as merging
+from scanweld.mapping.storage import kernels as storage
+from scanweld.registration.consistency import kernels as cliques
+called = [mapping.show_pages, merging.merge_layers, storage.move_pages, storage.cull_pages, storage.fit_boxes,
+          storage.settle_pages, storage.clean_pages, places.count_shared_words, cliques.branch_and_bound, cliques.induced]
+print([kernel.__name__ for kernel in called if not kernel.signatures])
+"""
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+        assert done.stdout.splitlines()[-1] == "[]"
 
     def test_pairs_compile_by_themselves(self) -> None:
         """What the process beside runs is right: it finds a motion, and so goes through every kernel."""

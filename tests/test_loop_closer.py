@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import replace
 from itertools import pairwise
 
@@ -16,12 +17,13 @@ from scanweld.loop_closure.held_out import fits_better, fits_in_place
 from scanweld.loop_closure.keyframes import KeyframeConfig
 from scanweld.loop_closure.loop_closer import KeyframeLoopCloser, LoopClosingConfig
 from scanweld.loop_closure.place_recognition import PlaceConfig
+from scanweld.parallel import limited_threads
 from scanweld.trajectory import FrameResult, FrameState
 
 COUNT = 240
 STEP = 10
 DENSE = LoopClosingConfig(
-    places=PlaceConfig(keyframes=KeyframeConfig(max_shift=0.05, max_turn_rad=0.08)), min_gap=6, drift=0.05
+    places=PlaceConfig(keyframes=KeyframeConfig(max_shift=0.05, max_turn_rad=0.08)), min_gap=6, drift=0.05, lag_frames=0
 )
 
 
@@ -70,6 +72,72 @@ def test_a_drifted_path_is_bent_back() -> None:
     off, turn = pose_error(last.T_world_camera, true[last.frame_index])
     assert off < 0.25 * pose_error(drifted[last.frame_index], true[last.frame_index])[0]
     assert turn < 1.5
+
+
+class TestLag:
+    """What was found out about a keyframe takes effect so many frames later, never mind when it was known."""
+
+    BIAS = np.array([0.006, 0.003, -0.004, 0.0, 0.003, 0.002])
+
+    @staticmethod
+    def run(lag: int, threads: int = 2) -> tuple[KeyframeLoopCloser, list[int], list[np.ndarray]]:
+        """Frames are looked at again and again, so that keyframes are ten frames apart."""
+        frames, true = sequence()
+        closer, drifted = KeyframeLoopCloser(replace(DENSE, lag_frames=lag)), drifting(true, TestLag.BIAS)
+        seen = [k // 10 for k in range(10 * len(frames))]
+        with limited_threads(threads):
+            closed = feed(closer, [replace(frames[k], timestamp_s=float(i)) for i, k in enumerate(seen)],
+                          [drifted[k] for k in seen])  # fmt: skip
+        return closer, closed, [keyframe.T_world_camera for keyframe in closer.database.keyframes]
+
+    def test_the_same_loops_later(self) -> None:
+        _, at_once, poses = self.run(0)
+        _, later, lagging = self.run(7)
+        assert later[0] == at_once[0] + 7
+        np.testing.assert_allclose(lagging[: at_once[0] // 10], poses[: at_once[0] // 10], atol=0.02)
+
+    def test_the_number_of_threads_changes_nothing(self) -> None:
+        (_, one, poses), (_, two, others) = self.run(7, 1), self.run(7, 2)
+        assert one == two != []
+        assert np.stack(poses).tobytes() == np.stack(others).tobytes()
+
+    def test_keyframes_since_move_with_the_last_before(self) -> None:
+        """With a lag of 25 frames there are keyframes that the search did not know of."""
+        frames, true = sequence()
+        closer, drifted = KeyframeLoopCloser(replace(DENSE, lag_frames=25)), drifting(true, self.BIAS)
+        for k in range(10 * len(frames)):
+            before = np.stack([np.eye(4), *(keyframe.T_world_camera for keyframe in closer.database.keyframes)])[1:]
+            known = closer._known
+            found = closer.process(sw.build_pyramid(frames[k // 10]), tracked(k, drifted[k // 10]))
+            if found is not None:
+                break
+        assert known < len(before)
+        assert found.keyframe_ids.tolist() == list(range(len(before)))
+        after = np.stack([keyframe.T_world_camera for keyframe in closer.database.keyframes])
+        np.testing.assert_allclose(found.T_new_old @ before, after, atol=1e-12)
+        np.testing.assert_allclose(found.T_new_old[known:], found.T_new_old[[known - 1] * (len(before) - known)])
+        np.testing.assert_allclose(
+            se3.inverse(after[known - 1]) @ after[known:], se3.inverse(before[known - 1]) @ before[known:], atol=1e-12
+        )
+
+    def test_what_is_under_way_can_be_had_at_once_and_copied(self) -> None:
+        frames, true = sequence()
+        drifted = drifting(true, self.BIAS)
+        closer = KeyframeLoopCloser(replace(DENSE, lag_frames=10**6))
+        assert not feed(closer, frames, drifted)
+        other = copy.deepcopy(closer)
+        found = closer.conclude()
+        assert found is not None
+        while closer.conclude() is not None:
+            pass
+        assert closer.conclude() is None
+        np.testing.assert_array_equal(other.conclude().T_new_old, found.T_new_old)
+
+    def test_few_wait(self) -> None:
+        frames, true = sequence()
+        closer = KeyframeLoopCloser(replace(DENSE, lag_frames=10**6))
+        feed(closer, frames, true)
+        assert len(closer._queries) == 4
 
 
 def test_the_first_keyframe_stays_and_all_poses_are_rigid() -> None:

@@ -177,7 +177,7 @@ class TestTwins:
     def feed(self) -> list[Join]:
         config = sw.RenderConfig(scene="twin-rooms", width=CAMERA.width, height=CAMERA.height, noise="kinect")
         sequence = sw.SyntheticSequence(config)
-        closer, joins = KeyframeLoopCloser(), []
+        closer, joins = KeyframeLoopCloser(sw.LoopClosingConfig(lag_frames=0)), []
         for steps in (self.ONE, self.OTHER):
             for k in steps:
                 pyramid, T = sw.build_pyramid(sequence.read(k)), sequence.ground_truth.T_world_camera[k]

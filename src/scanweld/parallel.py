@@ -92,7 +92,7 @@ _num_threads = max(
     1, min(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1, 16)
 )
 _pool: ThreadPoolExecutor | None = None
-_background: ThreadPoolExecutor | None = None
+_background: dict[str, ThreadPoolExecutor] = {}
 _inside = threading.local()
 _limit: contextvars.ContextVar[int | None] = contextvars.ContextVar("scanweld_threads", default=None)
 
@@ -166,12 +166,12 @@ def run_ranges(count: int, body: Callable[[int, int], object], *, grain: int = 1
             future.result()
 
 
-def in_background(call: Callable[[], _One]) -> Future[_One]:
-    """Call on another thread; what it raises, the result does. Such calls take turns."""
-    global _background
-    if _background is None:
-        _background = ThreadPoolExecutor(max_workers=1, thread_name_prefix="scanweld-background")
-    return _background.submit(call)
+def in_background(call: Callable[[], _One], lane: str = "") -> Future[_One]:
+    """Call on another thread; what it raises, the result does. Calls of one lane take turns."""
+    if lane not in _background:
+        name = f"scanweld-background-{lane}".rstrip("-")
+        _background[lane] = ThreadPoolExecutor(max_workers=1, thread_name_prefix=name)
+    return _background[lane].submit(call)
 
 
 def _enter_pool() -> None:
@@ -179,13 +179,14 @@ def _enter_pool() -> None:
 
 
 def _finish_background() -> None:
-    if _background is not None:
-        _background.submit(lambda: None).result()  # calls take turns: those before it have ended
+    for executor in list(_background.values()):
+        executor.submit(lambda: None).result()  # calls take turns: those before it have ended
 
 
 def _forget_pool() -> None:
-    global _pool, _background
-    _pool = _background = None
+    global _pool
+    _pool = None
+    _background.clear()
 
 
 if hasattr(os, "register_at_fork"):  # threads do not survive a fork: a child would wait for its parent's

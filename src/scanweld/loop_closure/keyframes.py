@@ -118,6 +118,10 @@ class Keyframe:
         """Return the stored images with their surfaces."""
         return build_pyramid(self.frame(), surfaces)
 
+    def sighting(self, surfaces: SurfaceConfig | None = None) -> Sighting:
+        """Return what place recognition needs to know of the stored frame."""
+        return Sighting(self.pyramid(surfaces), self.features, self.code)
+
 
 def sighting_of(pyramid: SurfacePyramid, ferns: Ferns, config: KeyframeConfig | None = None) -> Sighting:
     """Reduce a frame, find its features and encode it."""

@@ -4,15 +4,18 @@
 look alike but do not fit where the map thinks they are. A place that is verified becomes an edge that may be wrong; the
 graph is solved, edges that the odometry cannot explain are dropped, and the answer is kept only when keyframes that
 took no part fit each other better than before: a closure that looks right but bends the rest is worse than none.
+All this takes as long as several frames, so it is done on a thread beside them and takes effect a fixed number of
+frames later (:mod:`~.search`, docs/decisions/0020-loops-beside-tracking.md).
 Keyframes of all submaps are in one database, each with the number of its own: a new one is also compared with those of
 other submaps, which may join them (:mod:`~.joining`).
 """
 
 from __future__ import annotations
 
-import logging
+from collections.abc import Callable
+from concurrent.futures import Future
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -21,17 +24,15 @@ from scanweld.config import check_ranges, section, setting
 from scanweld.geometry import se3
 from scanweld.geometry.depth import SurfacePyramid
 from scanweld.geometry.views import MapCorrection
-from scanweld.loop_closure.held_out import fits_better, fits_in_place
-from scanweld.loop_closure.joining import Join, JoinFinder, PlacePair
+from scanweld.loop_closure.joining import Join, JoinFinder
 from scanweld.loop_closure.keyframes import Keyframe, Sighting
 from scanweld.loop_closure.place_recognition import KeyframeDatabase, PlaceConfig
-from scanweld.loop_closure.place_verification import VerificationConfig, relocalise, verify_place
-from scanweld.registration.pose_graph import PoseGraph, edge_information
+from scanweld.loop_closure.place_verification import VerificationConfig, relocalise
+from scanweld.loop_closure.search import Edge, Found, Query, find_place
+from scanweld.parallel import get_num_threads, in_background, limited_threads
 from scanweld.registration.result import RegistrationResult, Status
 from scanweld.state import Stateful
 from scanweld.trajectory import FrameResult
-
-logger = logging.getLogger(__name__)
 
 _LEAST_SIGMA_M, _LEAST_SIGMA_RAD = 1e-3, 1e-3  # of the motion between two keyframes, however short
 _SIGMA_RAD_PER_M = 0.005
@@ -78,19 +79,15 @@ class LoopClosingConfig:
         high=1.0,
     )
 
+    lag_frames: int = setting(
+        10,
+        "tracked frames after which what was found out about a keyframe takes effect; raise where frames wait for it, "
+        "0 lets each keyframe wait until it is known",
+        low=0,
+    )
+
     def __post_init__(self) -> None:
         check_ranges(self)
-
-
-@dataclass(frozen=True, slots=True)
-class _Edge:
-    """A measured motion between two keyframes; `loop` edges may be wrong."""
-
-    i: int
-    j: int
-    T_i_j: Float64
-    information: Float64
-    loop: bool
 
 
 class KeyframeLoopCloser(Stateful):
@@ -105,9 +102,10 @@ class KeyframeLoopCloser(Stateful):
 
     STATE: ClassVar = {
         "database": Stateful, "num_closures": int, "submap": int, "_submaps": Int64, "_newest": dict[int, int],
-        "_num_submaps": int, "_joins": Stateful, "_edges": list[_Edge], "_seen_since": bool,
+        "_num_submaps": int, "_joins": Stateful, "_edges": list[Edge], "_seen_since": bool,
+        "_queries": list[Query], "_sought": Query | None, "_known": int, "_wait": int,
     }  # fmt: skip
-    MADE = frozenset({"config"})
+    MADE = frozenset({"config", "_finding"})
 
     def __init__(self, config: LoopClosingConfig | None = None) -> None:
         self.config = config or LoopClosingConfig()
@@ -118,8 +116,16 @@ class KeyframeLoopCloser(Stateful):
         self._newest: dict[int, int] = {}  # keyframe of each submap
         self._num_submaps = 1  # that there ever were
         self._joins = JoinFinder(self.config.drift, self.config.places.keyframes.surfaces)
-        self._edges: list[_Edge] = []
+        self._edges: list[Edge] = []
         self._seen_since = True  # whether the camera was tracked all the way from the last keyframe
+        self._queries: list[Query] = []  # that are still to be looked into
+        self._sought: Query | None = None  # what is looked into now, among so many keyframes, for so many frames more
+        self._known = 0
+        self._wait = 0
+        self._finding: Future[Found] | None = None  # where that is done on another thread
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_finding": None}  # a copy looks itself
 
     @property
     def keyframe(self) -> int:
@@ -132,20 +138,26 @@ class KeyframeLoopCloser(Stateful):
         return [(edge.i, edge.j) for edge in self._edges if edge.loop]
 
     def process(self, pyramid: SurfacePyramid, result: FrameResult) -> MapCorrection | Join | None:
-        """Look at a tracked frame; return a correction when a loop was closed, or what joins two submaps."""
-        if not self.database.reason(pyramid, result.T_world_camera, among=self._in_submap()):
-            return None
-        sighting = self.database.sight(pyramid)
-        if sighting.usable < self.database.config.keyframes.min_usable:
-            return None
-        keyframe = self._add(sighting, result.T_world_camera, result.index)
-        for candidate in self._revisited(sighting, keyframe):
-            loop = self._verified(sighting, keyframe, candidate)
-            if loop is not None:
-                correction = self._close(loop)
-                if correction is not None:
-                    return correction
-        return self._joining(sighting, keyframe)
+        """Look at a tracked frame; return a correction where a loop is closed, or what joins two submaps.
+
+        Both are about a keyframe of `lag_frames` ago.
+        """
+        self._wait -= 1
+        answer = self._answer() if self._sought is not None and self._wait <= 0 else None
+        if answer is None:
+            self._consider(pyramid, result)
+            self._begin_search()
+            if self._sought is not None and self._wait <= 0:  # without a lag
+                answer = self._answer()
+        return answer
+
+    def conclude(self) -> MapCorrection | Join | None:
+        """Return at once what `process` would have returned some frames later; None when there is nothing more."""
+        answer = None
+        while answer is None and (self._sought is not None or self._queries):
+            self._begin_search()
+            answer = self._answer()
+        return answer
 
     def relocalise(self, pyramid: SurfacePyramid) -> RegistrationResult:
         """Look for a lost camera; only CONVERGED says that T_target_source is T_world_camera."""
@@ -186,7 +198,7 @@ class KeyframeLoopCloser(Stateful):
         self.database.move(poses)
         # The first edge holds the two parts of the graph together, so it may not be dropped; the second may.
         self._edges += [
-            _Edge(p.i, p.j, p.T_i_j, p.information, loop) for p, loop in zip(join.pairs, (False, True), strict=True)
+            Edge(p.i, p.j, p.T_i_j, p.information, loop) for p, loop in zip(join.pairs, (False, True), strict=True)
         ]
         self.submap = join.kept if self.submap == join.joined else self.submap
         return MapCorrection(moved.astype(np.int32), np.tile(join.T_kept_joined, (len(moved), 1, 1)))
@@ -216,7 +228,7 @@ class KeyframeLoopCloser(Stateful):
         self._seen_since = True
         return keyframe
 
-    def _odometry(self, before: Keyframe, keyframe: Keyframe) -> _Edge:
+    def _odometry(self, before: Keyframe, keyframe: Keyframe) -> Edge:
         """Return the edge from the keyframe before; how well the motion is known grows with its length."""
         T_i_j = se3.inverse(before.T_world_camera) @ keyframe.T_world_camera
         length, turn = float(np.linalg.norm(T_i_j[:3, 3])), float(se3.rotation_angle_rad(T_i_j))
@@ -226,77 +238,83 @@ class KeyframeLoopCloser(Stateful):
         if not self._seen_since:  # it was found again against the map, which is a measurement, too, but of another kind
             sigma_m, sigma_rad = _UNSEEN_SIGMA, _UNSEEN_SIGMA
         sigmas = np.repeat([sigma_m, sigma_rad], 3)
-        return _Edge(before.index, keyframe.index, T_i_j, np.diag(sigmas**-2.0), False)
+        return Edge(before.index, keyframe.index, T_i_j, np.diag(sigmas**-2.0), False)
 
-    def _revisited(self, sighting: Sighting, keyframe: Keyframe) -> list[int]:
-        """Return older keyframes that look alike, where the map does not already agree."""
-        allowed = np.zeros(len(self.database), np.bool_)
-        allowed[self._members()[: -1 - self.config.min_gap]] = True
+    def _consider(self, pyramid: SurfacePyramid, result: FrameResult) -> None:
+        """Make a frame a keyframe if there is a reason to, and ask where else its place is known."""
+        if not self.database.reason(pyramid, result.T_world_camera, among=self._in_submap()):
+            return
+        sighting = self.database.sight(pyramid)
+        if sighting.usable < self.database.config.keyframes.min_usable:
+            return
+        older = self._in_submap()
+        older[self._members()[-self.config.min_gap :]] = False
+        revisited, elsewhere = (self._alike(sighting, allowed) for allowed in (older, ~self._in_submap()))
+        keyframe = self._add(sighting, result.T_world_camera, result.index)
+        if revisited or elsewhere:
+            self._queries = [*self._queries, Query(keyframe.index, self.submap, revisited, elsewhere)][-_MOST_QUERIES:]
+
+    def _alike(self, sighting: Sighting, allowed: Bool) -> list[int]:
+        """Return the keyframes among those allowed that look most like a frame."""
         if not allowed.any():
             return []
-        found = self.database.query(sighting, self.config.candidates, allowed=allowed)
-        return [
-            candidate.index
-            for candidate in found
-            if not fits_in_place(
-                sighting.pyramid,
-                self.database[candidate.index],
-                se3.inverse(self.database[candidate.index].T_world_camera) @ keyframe.T_world_camera,
-                self.config.places.keyframes.surfaces,
-            )
-        ]
+        return [candidate.index for candidate in self.database.query(sighting, self.config.candidates, allowed=allowed)]
 
-    def _verified(self, sighting: Sighting, keyframe: Keyframe, candidate: int) -> _Edge | None:
-        """Return the edge from a candidate when it shows the place of the new keyframe."""
-        result = verify_place(sighting, self.database[candidate], self.config.verification)
-        if not result.status.success:
-            return None
-        return _Edge(candidate, keyframe.index, result.T_target_source, edge_information(result), True)
+    def _begin_search(self) -> None:
+        """Begin to look into the next query, if none is being looked into."""
+        if self._sought is None and self._queries:
+            self._sought, *self._queries = self._queries
+            self._known, self._wait = len(self.database), self.config.lag_frames
+            if get_num_threads() > 1 and self._wait > 0:
+                self._finding = in_background(self._search(self._sought), lane="loops")
 
-    def _joining(self, sighting: Sighting, keyframe: Keyframe) -> Join | None:
-        """Compare a new keyframe with those of other submaps; return what joins two of them."""
-        elsewhere = ~self._in_submap()
-        if not elsewhere.any():
-            return None
-        for candidate in self.database.query(sighting, self.config.candidates, allowed=elsewhere):
-            edge = self._verified(sighting, keyframe, candidate.index)
-            if edge is not None:
-                pair = PlacePair(edge.i, edge.j, edge.T_i_j, edge.information)
-                join = self._joins.add(pair, self.database.keyframes, self._submaps.tolist())
-                if join is not None:
-                    return join
+    def _search(self, query: Query) -> Callable[[], Found]:
+        """Return what looks into a query, with keyframes as they are now."""
+        keyframes, members = self.database.keyframes[: self._known], self._then(query.submap)
+        edges = [edge for edge in self._edges if max(edge.i, edge.j) < self._known]
+        surfaces, verification = self.config.places.keyframes.surfaces, self.config.verification
+
+        def search() -> Found:
+            with limited_threads(1):  # tracking needs the others
+                return find_place(query, keyframes, members, edges, surfaces, verification)
+
+        return search
+
+    def _then(self, submap: int) -> Int64:
+        """Return the keyframes of a submap when the search began."""
+        return np.flatnonzero(self._submaps[: self._known] == submap)
+
+    def _answer(self) -> MapCorrection | Join | None:
+        """End the search, and let what it found take effect."""
+        query, finding = self._sought, self._finding
+        assert query is not None
+        found = self._search(query)() if finding is None else finding.result()
+        self._sought, self._finding = None, None
+        if query.submap != self.submap:
+            return None  # the camera has been found elsewhere meanwhile
+        if found.loop is not None:
+            return self._close(found, self._then(query.submap))
+        for pair in found.pairs:
+            join = self._joins.add(pair, self.database.keyframes, self._submaps.tolist())
+            if join is not None:
+                return join
         return None
 
-    def _close(self, loop: _Edge) -> MapCorrection | None:
-        """Solve the graph with one more edge; keep the answer when keyframes that took no part fit better."""
-        members = self._members()
-        node = {int(index): k for k, index in enumerate(members)}
-        keyframes = [self.database[index] for index in members]
-        old = np.stack([keyframe.T_world_camera for keyframe in keyframes])
-        graph = PoseGraph()
-        for pose in old:
-            graph.add_node(pose)
-        edges = [*self._edges, loop]
-        for edge in edges:
-            if edge.i in node:
-                graph.add_edge(node[edge.i], node[edge.j], edge.T_i_j, edge.information, robust=edge.loop)
-        solved = graph.optimise()
-        if not solved.status.has_pose or solved.weights[-1] < _KEPT_WEIGHT:
-            logger.info("loop %d -> %d: the rest of the path does not allow it", loop.i, loop.j)
-            return None
-        new = solved.T_world_node
-        if not fits_better(keyframes, old, new, node[loop.i], node[loop.j], self.config.places.keyframes.surfaces):
-            logger.info("loop %d -> %d: other keyframes do not fit better", loop.i, loop.j)
-            return None
-        self._edges = edges
-        poses = [keyframe.T_world_camera for keyframe in self.database.keyframes]
+    def _close(self, found: Found, then: Int64) -> MapCorrection:
+        """Move the keyframes of the submap: those of `then` as found, later ones with the last of these."""
+        assert found.loop is not None
+        self._edges.append(found.loop)
+        poses, members = [keyframe.T_world_camera for keyframe in self.database.keyframes], self._members()
+        old = np.stack([poses[index] for index in members])
+        T_new_old = found.T_world_keyframe @ se3.inverse(old[: len(then)])
+        T_new_old = np.concatenate([T_new_old, np.repeat(T_new_old[-1:], len(members) - len(then), axis=0)])
+        new = np.concatenate([found.T_world_keyframe, T_new_old[len(then) :] @ old[len(then) :]])
         for index, pose in zip(members, new, strict=True):
             poses[index] = pose
         self.database.move(poses)
         self.num_closures += 1
-        T_new_old = new @ se3.inverse(old)
         return MapCorrection(members.astype(np.int32), T_new_old)
 
 
-_KEPT_WEIGHT = 0.5
-"""Robust weight of an edge that was not dropped."""
+_MOST_QUERIES = 4
+"""Keyframes that wait to be looked for; the oldest is left out where more come than can be looked into."""

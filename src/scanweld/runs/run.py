@@ -300,6 +300,7 @@ def run_sequence(
                 load_kernels()
             played_by = (clock or WallClock()) if realtime else None
             _process_all(run.slam, sequence, run.tally, given, after_frame, played_by)
+            run.slam.finish()
             if calibrate or refine:
                 keep(run.slam, -1, None, surely=True)
             if calibrate:

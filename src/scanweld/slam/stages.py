@@ -87,6 +87,15 @@ class LoopCloser(Protocol):
 
 
 @runtime_checkable
+class DeferringLoopCloser(LoopCloser, Protocol):
+    """A loop closer that looks for loops beside the frames, and answers some frames later."""
+
+    def conclude(self) -> MapCorrection | Join | None:
+        """Return at once what `process` would return some frames later; None when there is nothing more."""
+        ...
+
+
+@runtime_checkable
 class SubmapLoopCloser(LoopCloser, Protocol):
     """A loop closer whose keyframes may be in several submaps, each with a world of its own."""
 

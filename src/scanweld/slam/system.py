@@ -31,7 +31,7 @@ from scanweld.registration.result import RegistrationResult, Status
 from scanweld.slam.health import HealthConfig, TrackingHealth, is_near
 from scanweld.slam.motion import POSED, UNSEEN, ConstantVelocity, trajectory_of
 from scanweld.slam.rotation_aid import RotationAid, as_rotation
-from scanweld.slam.stages import DeferringMapper, LoopCloser, Mapper, Tracker
+from scanweld.slam.stages import DeferringLoopCloser, DeferringMapper, LoopCloser, Mapper, Tracker
 from scanweld.slam.submaps import Atlas, SubmapConfig, in_one_world, main_submap
 from scanweld.state import Stateful
 from scanweld.tracking.dynamics import DynamicsConfig, MotionDetector, leave_out, track_static
@@ -81,7 +81,7 @@ class Slam(Stateful):
         "_keyframes": list[int], "_last_posed": int, "_health": Stateful, "_dynamics": Stateful | None,
         "_moving": Bool | None, "_motion": Stateful, "_rotation": Stateful,
     }  # fmt: skip
-    MADE = frozenset({"tracker", "surfaces", "_T_world_first"})
+    MADE = frozenset({"tracker", "surfaces", "_T_world_first", "_last_tracked"})
 
     def __init__(
         self,
@@ -109,6 +109,7 @@ class Slam(Stateful):
         self._moving: Bool | None = None  # pixels (H, W) that move in the frame at hand
         self._motion = ConstantVelocity()
         self._rotation = RotationAid()
+        self._last_tracked: tuple[SurfacePyramid, int] | None = None  # and the number of that frame
         self._T_world_first = _near_pose(np.eye(4) if T_world_first is None else T_world_first, "T_world_first")
 
     @property
@@ -124,34 +125,46 @@ class Slam(Stateful):
 
     @property
     def map(self) -> Any:
-        """The map of the main submap; to be asked for anew after each frame, which may still be fused into it.
-
-        What mappers put off after a closed loop is done first; until the last frame `mapper.map` goes without.
-        """
+        """The map of the main submap, finished; to be asked for anew after each frame, which may be fused into it."""
         return self.maps[main_submap(self._results)]
 
     @property
     def maps(self) -> dict[int, Any]:
-        """The map of each submap, by its number in the results; see `map`."""
-        for mapper in self.atlas.mappers.values():
-            if isinstance(mapper, DeferringMapper):
-                mapper.finish()
+        """The map of each submap, finished, by its number in the results."""
+        self.finish()
         return {submap: mapper.map for submap, mapper in self.atlas.mappers.items()}
 
     @property
     def unjoined(self) -> tuple[int, ...]:
         """The submaps whose place in the world of the main one is not known."""
+        self.finish()
         return tuple(submap for submap in self.atlas.mappers if submap != main_submap(self._results))
 
     @property
     def main_results(self) -> list[FrameResult]:
-        """The results in the world of the main submap; frames of other submaps are LOST there."""
+        """The results, finished, in the world of the main submap; frames of other submaps are LOST there."""
+        self.finish()
         return in_one_world(self.results, main_submap(self._results))
 
     @property
     def trajectory(self) -> Trajectory:
-        """One pose per processed frame, LOST stretches interpolated where tracking was regained."""
+        """One pose per processed frame, finished; LOST stretches are interpolated where tracking was regained."""
         return trajectory_of(self.main_results)
+
+    def finish(self) -> None:
+        """Do at once what stages put off so that no frame has to wait: for use after the last one.
+
+        The properties above that say so do it first. Asked for between two frames they bring a loop about some frames
+        earlier than it would have been closed; `results` and `mapper.map` are as they are.
+        """
+        while isinstance(self.loop_closer, DeferringLoopCloser):
+            found = self.loop_closer.conclude()
+            if found is None:
+                break
+            self._follow(found)
+        for mapper in self.atlas.mappers.values():
+            if isinstance(mapper, DeferringMapper):
+                mapper.finish()
 
     def restored(self) -> None:
         """Check that the frames so far are numbered, each with its keyframe."""
@@ -273,6 +286,7 @@ class Slam(Stateful):
         config : what is estimated, and how; by default poses alone
         apply : move map and trajectory; without it the answer is only returned
         """
+        self.finish()
         database = getattr(self.loop_closer, "database", None)  # other loop closers may keep no keyframes
         main = main_submap(self._results)
         everything = () if database is None else database.keyframes
@@ -375,23 +389,32 @@ class Slam(Stateful):
 
     def _close_loops(self, pyramid: SurfacePyramid, result: FrameResult) -> None:
         """Let the loop closer look at a tracked frame, and do what follows."""
+        self._last_tracked = pyramid, result.index
         found = self.loop_closer.process(pyramid, result)
+        if found is not None:
+            self._follow(found)
+
+    def _follow(self, found: MapCorrection | Join) -> None:
         if isinstance(found, Join):
-            self._join(found, pyramid, result)
-        elif found is not None:
+            self._join(found)
+        else:
             self.mapper.apply(found)
             self._correct(found)
 
-    def _join(self, join: Join, pyramid: SurfacePyramid, result: FrameResult) -> None:
-        """Make one of two submaps, unless the frame does not fit the map of the other one where it should be."""
+    def _join(self, join: Join) -> None:
+        """Make one of two submaps, unless the last frame does not fit the map of the other one where it should be."""
+        if self._last_tracked is None:
+            return
+        pyramid, index = self._last_tracked
+        T_world_camera = self._results[index].T_world_camera
         other, T_other_here = self.atlas.other(join)
-        start = T_other_here @ result.T_world_camera
+        start = T_other_here @ T_world_camera
         view = self.atlas.mappers[other].view(start, pyramid.frame.camera)
         aligned = self.tracker.track(pyramid, view, start)
         if not (aligned.status.success and is_near(aligned.T_target_source, start)):
             return
         # The whole map knows better than a pair of keyframes how the two worlds lie to each other.
-        T_other_here = aligned.T_target_source @ se3.inverse(result.T_world_camera)
+        T_other_here = aligned.T_target_source @ se3.inverse(T_world_camera)
         T = T_other_here if other == join.kept else se3.inverse(T_other_here)
         self._correct(self.atlas.join(replace(join, T_kept_joined=T)))
         self._results = [replace(r, submap=join.kept) if r.submap == join.joined else r for r in self._results]

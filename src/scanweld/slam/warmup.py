@@ -17,7 +17,8 @@ from scanweld.geometry.frame import Frame
 from scanweld.geometry.views import MapCorrection
 from scanweld.loop_closure.keyframes import KeyframeConfig
 from scanweld.loop_closure.place_recognition import KeyframeDatabase, PlaceConfig
-from scanweld.loop_closure.place_verification import relocalise
+from scanweld.loop_closure.place_verification import VerificationConfig, relocalise
+from scanweld.loop_closure.search import Edge, Query, close_loop, find_place
 from scanweld.mapping.mapper import SurfelMapper
 from scanweld.mapping.rendering import render_picture
 from scanweld.parallel import kernels_are_cached
@@ -49,8 +50,10 @@ def load_kernels() -> None:
 
 def compile_pairs() -> None:
     """Compile what aligns pairs of points."""
-    points = np.random.default_rng(2).random((40, 3))
-    align_pairs_robustly(points, points + 1.0, np.full(len(points), 0.01))
+    rng = np.random.default_rng(2)
+    points = rng.random((40, 3))
+    for noise in (0.0, 0.02):  # more than is allowed for: the largest consistent set has to be searched for
+        align_pairs_robustly(points, points + 1.0 + rng.normal(0.0, noise, points.shape), np.full(len(points), 0.01))
 
 
 @contextlib.contextmanager
@@ -95,9 +98,20 @@ def _compile_frames(report: Callable[[str], None], wait: Callable[[], object]) -
     detector.find(nearer, mapper.view(pose, camera), pose)
     report("pictures (4 of 5)")
     render_picture(mapper.map, pose, camera)
-    mapper.apply(MapCorrection(np.zeros(1, np.int32), se3.exp([0.1, 0, 0, 0, 0, 0])[None]))
+    behind, correction = se3.exp([0, 0, -0.1, 0, 0, 0]), se3.exp([0, 0, 0.09, 0, 0, 0])
+    mapper.fuse(
+        pyramid, behind, keyframe=20
+    )  # a layer behind the other one, which a loop brings to within a centimetre
+    mapper.apply(MapCorrection(np.array([20], np.int32), correction[None]))
+    mapper.finish()
+    mapper.view(behind, camera)
     report("places (5 of 5)")
     wait()
     database = KeyframeDatabase(PlaceConfig(keyframes=KeyframeConfig(min_usable=0.001)))
-    database.add(database.sight(pyramid), pose, frame_index=0)
+    for k, T_world_camera in enumerate((pose, pose, behind, behind)):
+        database.add(database.sight(pyramid), T_world_camera, frame_index=k)
     relocalise(database.sight(pyramid), database)
+    steps = [Edge(k, k + 1, pose, np.eye(6), False) for k in range(3)]
+    known, surfaces = (database.keyframes, np.arange(4), steps), database.config.keyframes.surfaces
+    find_place(Query(3, 0, [0], []), *known, surfaces, VerificationConfig())
+    close_loop(Edge(0, 3, pose, np.eye(6), True), *known, surfaces)
