@@ -196,7 +196,8 @@ from scanweld.mapping.merging import kernels as merging
 from scanweld.mapping.storage import kernels as storage
 from scanweld.registration.consistency import kernels as cliques
 called = [mapping.show_pages, merging.merge_layers, storage.move_pages, storage.cull_pages, storage.fit_boxes,
-          storage.settle_pages, storage.clean_pages, places.count_shared_words, cliques.branch_and_bound, cliques.induced]
+          storage.settle_pages, storage.clean_pages, places.count_shared_words, cliques.branch_and_bound,
+          cliques.induced]
 print([kernel.__name__ for kernel in called if not kernel.signatures])
 """
         done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
