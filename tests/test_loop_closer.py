@@ -157,6 +157,25 @@ def test_a_path_without_drift_is_left_alone() -> None:
     assert len(closer.database) > 10
 
 
+def test_places_that_are_known_need_no_more_keyframes() -> None:
+    """There and back and there again, each step of the way back between two keyframes: hardly any is added."""
+    frames, true = sequence()
+    closer = KeyframeLoopCloser(replace(DENSE, places=PlaceConfig(keyframes=KeyframeConfig(max_shift=0.08))))
+    counts, at = [], []
+    for i in range(3 * len(frames)):
+        k = i % len(frames)
+        frame = replace(frames[k], timestamp_s=float(i))
+        closer.process(sw.build_pyramid(frame), tracked(i, true[k]))
+        counts.append(len(closer.database))
+        at.append(closer.keyframe)
+        off, turn = pose_error(closer.database[closer.keyframe].T_world_camera, true[k])
+        assert off < 0.4
+        assert turn < 20
+    assert counts[len(frames) // 2] > 8
+    assert counts[-1] <= counts[len(frames) // 2] + 2
+    assert min(at[len(frames) :]) < 3  # the camera is at old ones again
+
+
 def test_a_twin_room_is_no_loop() -> None:
     """The same views five metres on, as in a room that is an exact copy: no drift of the odometry explains that."""
     frames, true = sequence()

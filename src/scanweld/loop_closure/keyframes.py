@@ -178,12 +178,17 @@ def keyframe_reason(
     if similarity < config.max_similarity:
         return f"unlike all keyframes: {similarity:.0%} of the ferns agree with the nearest"
     motion = se3.inverse(last.T_world_camera) @ T_world_camera
-    depth = pyramid.levels[0].depth_m[::4, ::4]
-    shift = float(np.linalg.norm(motion[:3, 3]) / np.median(depth[depth > 0])) if depth.any() else 0.0
+    shift, turn = (float(size) for size in motion_size(pyramid, motion))
     if shift > config.max_shift:
         return f"moved by {shift:.0%} of the depth"
-    turn = float(se3.rotation_angle_rad(motion))
     return f"turned by {np.rad2deg(turn):.0f} degrees" if turn > config.max_turn_rad else ""
+
+
+def motion_size(pyramid: SurfacePyramid, motion: Float64) -> tuple[Float64, Float64]:
+    """Return the shift of motions (..., 4, 4), in median depths of a frame, and their turn [rad]."""
+    depth = pyramid.levels[0].depth_m[::4, ::4]
+    median = float(np.median(depth[depth > 0])) if depth.any() else np.inf
+    return np.linalg.norm(motion[..., :3, 3], axis=-1) / median, se3.rotation_angle_rad(motion)
 
 
 def usable_share(pyramid: SurfacePyramid) -> float:

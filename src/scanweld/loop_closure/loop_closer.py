@@ -101,7 +101,7 @@ class KeyframeLoopCloser(Stateful):
     """
 
     STATE: ClassVar = {
-        "database": Stateful, "num_closures": int, "submap": int, "_submaps": Int64, "_newest": dict[int, int],
+        "database": Stateful, "num_closures": int, "submap": int, "_submaps": Int64, "_current": dict[int, int],
         "_num_submaps": int, "_joins": Stateful, "_edges": list[Edge], "_seen_since": bool,
         "_queries": list[Query], "_sought": Query | None, "_known": int, "_wait": int,
     }  # fmt: skip
@@ -113,7 +113,7 @@ class KeyframeLoopCloser(Stateful):
         self.num_closures = 0
         self.submap = 0
         self._submaps: Int64 = np.empty(0, np.int64)  # of each keyframe
-        self._newest: dict[int, int] = {}  # keyframe of each submap
+        self._current: dict[int, int] = {}  # keyframe of each submap that the camera is at, or was at last
         self._num_submaps = 1  # that there ever were
         self._joins = JoinFinder(self.config.drift, self.config.places.keyframes.surfaces)
         self._edges: list[Edge] = []
@@ -130,7 +130,7 @@ class KeyframeLoopCloser(Stateful):
     @property
     def keyframe(self) -> int:
         """The keyframe that new surfels and frames belong to."""
-        return self._newest.get(self.submap, 0)
+        return self._current.get(self.submap, 0)
 
     @property
     def loops(self) -> list[tuple[int, int]]:
@@ -194,7 +194,8 @@ class KeyframeLoopCloser(Stateful):
         for index in moved:
             poses[index] = join.T_kept_joined @ poses[index]
         self._submaps[moved] = join.kept
-        self._newest[join.kept] = int(self._members(join.kept)[-1])
+        if self.submap == join.joined:
+            self._current[join.kept] = self._current[join.joined]
         self.database.move(poses)
         # The first edge holds the two parts of the graph together, so it may not be dropped; the second may.
         self._edges += [
@@ -206,7 +207,7 @@ class KeyframeLoopCloser(Stateful):
     def restored(self) -> None:
         """Check that submaps and edges are of keyframes that there are."""
         count = len(self.database)
-        named = [*self._newest.values(), *(k for edge in self._edges for k in (edge.i, edge.j))]
+        named = [*self._current.values(), *(k for edge in self._edges for k in (edge.i, edge.j))]
         if self._submaps.shape != (count,) or not all(0 <= index < count for index in named):
             raise ValueError("submaps or edges of keyframes that are not there")
 
@@ -219,12 +220,12 @@ class KeyframeLoopCloser(Stateful):
 
     def _add(self, sighting: Sighting, T_world_camera: Float64, frame_index: int) -> Keyframe:
         """Remember a frame in the submap at hand, with the motion from the keyframe before."""
-        before = self._members()
+        before = self._current.get(self.submap)
         keyframe = self.database.add(sighting, T_world_camera, frame_index=frame_index)
         self._submaps = np.append(self._submaps, self.submap)
-        self._newest[self.submap] = keyframe.index
-        if len(before):
-            self._edges.append(self._odometry(self.database[before[-1]], keyframe))
+        self._current[self.submap] = keyframe.index
+        if before is not None:
+            self._edges.append(self._odometry(self.database[before], keyframe))
         self._seen_since = True
         return keyframe
 
@@ -242,14 +243,19 @@ class KeyframeLoopCloser(Stateful):
 
     def _consider(self, pyramid: SurfacePyramid, result: FrameResult) -> None:
         """Make a frame a keyframe if there is a reason to, and ask where else its place is known."""
-        if not self.database.reason(pyramid, result.T_world_camera, among=self._in_submap()):
+        mine, last = self._in_submap(), self._current.get(self.submap)
+        if not self.database.reason(pyramid, result.T_world_camera, among=mine, last=last):
+            return
+        known = self.database.nearest(pyramid, result.T_world_camera, among=mine)
+        if known is not None:  # back where it was: the number of keyframes grows with the places, not with the time
+            self._current[self.submap], self._seen_since = known, True
             return
         sighting = self.database.sight(pyramid)
         if sighting.usable < self.database.config.keyframes.min_usable:
             return
-        older = self._in_submap()
+        older = mine.copy()
         older[self._members()[-self.config.min_gap :]] = False
-        revisited, elsewhere = (self._alike(sighting, allowed) for allowed in (older, ~self._in_submap()))
+        revisited, elsewhere = (self._alike(sighting, allowed) for allowed in (older, ~mine))
         keyframe = self._add(sighting, result.T_world_camera, result.index)
         if revisited or elsewhere:
             self._queries = [*self._queries, Query(keyframe.index, self.submap, revisited, elsewhere)][-_MOST_QUERIES:]

@@ -19,15 +19,19 @@ import numpy as np
 from scanweld.arrays import Array, Float64, Int32, UInt8
 from scanweld.config import check_ranges, section, setting
 from scanweld.errors import InvalidInputError
+from scanweld.geometry import se3
 from scanweld.geometry.depth import SurfacePyramid
 from scanweld.loop_closure import kernels
 from scanweld.loop_closure.ferns import FernCode, Ferns, similarities
+from scanweld.loop_closure.held_out import fits_in_place
 from scanweld.loop_closure.keyframes import (
     Keyframe,
     KeyframeConfig,
     Sighting,
     keyframe_of,
     keyframe_reason,
+    motion_size,
+    reduced_pyramid,
     sighting_of,
 )
 from scanweld.parallel import run_ranges
@@ -100,20 +104,43 @@ class KeyframeDatabase(Stateful):
         """Return what has to be known of a frame to add it or to look for its place."""
         return sighting_of(pyramid, self.ferns, self.config.keyframes)
 
-    def reason(self, pyramid: SurfacePyramid, T_world_camera: Float64, *, among: Array | None = None) -> str:
+    def reason(
+        self, pyramid: SurfacePyramid, T_world_camera: Float64, *, among: Array | None = None, last: int | None = None
+    ) -> str:
         """Say why a tracked frame should be added; "" when it should not (:func:`~.keyframes.keyframe_reason`).
 
-        `among` : (K,) bool, the keyframes of its own world, which it is compared with; all by default.
+        `among` : (K,) bool, the keyframes of its own world, which it is compared with; all by default. `last` : the
+        keyframe that the camera was at before, by default the newest of these.
         """
         mine = np.arange(len(self)) if among is None else np.flatnonzero(among)
         if len(mine) == 0:
             return keyframe_reason(pyramid, T_world_camera, None, 0.0, self.config.keyframes)
-        code, newest = self.ferns.encode(pyramid), int(mine[-1])
-        # Mostly the frame is like the newest keyframe, and the others need not be asked.
-        similarity = float(self.similarities(code, slice(newest, newest + 1))[0])
+        code, last = self.ferns.encode(pyramid), int(mine[-1]) if last is None else last
+        # Mostly the frame is like the last keyframe, and the others need not be asked.
+        similarity = float(self.similarities(code, slice(last, last + 1))[0])
         if similarity < self.config.keyframes.max_similarity:
             similarity = float(self.similarities(code)[mine].max())
-        return keyframe_reason(pyramid, T_world_camera, self[newest], similarity, self.config.keyframes)
+        return keyframe_reason(pyramid, T_world_camera, self[last], similarity, self.config.keyframes)
+
+    def nearest(self, pyramid: SurfacePyramid, T_world_camera: Float64, *, among: Array) -> int | None:
+        """Return the keyframe that would spare a frame being added; None when there is none.
+
+        It looks like the frame, was seen from as near by as two keyframes should be, and its depth agrees.
+
+        `among` : (K,) bool, the keyframes of the frame's own world.
+        """
+        config, mine = self.config.keyframes, np.flatnonzero(among)
+        alike = mine[self.similarities(self.ferns.encode(pyramid))[mine] >= config.max_similarity]
+        if len(alike) == 0:
+            return None
+        motions = se3.inverse(np.stack([self[index].T_world_camera for index in alike])) @ T_world_camera
+        shift, turn = motion_size(pyramid, motions)
+        apart = np.maximum(shift / config.max_shift, turn / config.max_turn_rad)
+        best = int(apart.argmin())
+        reduced = reduced_pyramid(pyramid, config)
+        if apart[best] > 1 or not fits_in_place(reduced, self[alike[best]], motions[best], config.surfaces):
+            return None
+        return int(alike[best])
 
     def add(self, sighting: Sighting, T_world_camera: Float64, *, frame_index: int) -> Keyframe:
         """Remember a frame that was seen from `T_world_camera`.
