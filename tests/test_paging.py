@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import logging
+import mmap
 import os
 from pathlib import Path
 
@@ -88,6 +89,33 @@ class TestResidence:
         assert residence.num_held == residence.room == 2
         assert witness.gone == [0, 1, 2, 3]
         assert residence.most_held == 5
+
+
+class TestMemory:
+    @pytest.mark.skipif(not hasattr(mmap, "MAP_ANONYMOUS"), reason="no ranges of addresses without memory")
+    def test_grows_in_place(self) -> None:
+        backing = Memory(room=1 << 30)
+        first = backing.grow(np.empty(0, np.float32), 5000)
+        first[:] = np.arange(5000)
+        second = backing.grow(first, 20_000_000)
+        assert np.shares_memory(first, second[:5000])
+        np.testing.assert_array_equal(second[:5000], np.arange(5000))
+
+    def test_copies_where_there_is_no_range(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr("scanweld.mapping.storage.backing._reserve", lambda size: None)
+        check_copied(Memory(room=1 << 30))
+
+    def test_copies_beyond_its_room(self) -> None:
+        check_copied(Memory(room=6000))
+
+
+def check_copied(backing: Memory) -> None:
+    first = backing.grow(np.empty(0, np.float32), 5000)
+    first[:] = np.arange(5000)
+    second = backing.grow(first, 20_000)
+    assert not np.shares_memory(first, second)
+    assert len(second) == 20_000
+    np.testing.assert_array_equal(second[:5000], np.arange(5000))
 
 
 class TestMappedFile:

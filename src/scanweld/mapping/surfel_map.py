@@ -72,7 +72,7 @@ class SurfelMap(Stateful):
 
     @property
     def capacity(self) -> int:
-        """Number of surfels that fit before the storage is doubled."""
+        """Number of surfels that fit before the storage grows."""
         return self.pages.capacity * PAGE
 
     @property

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import mmap
 import os
+import sys
 import tempfile
 import weakref
 from collections.abc import Iterable
@@ -18,14 +20,30 @@ logger = logging.getLogger(__name__)
 
 
 class Memory:
-    """The process's own memory; the array is copied when it grows."""
+    """The process's own memory.
+
+    It lies in a range of addresses with room for the largest map, behind which the system puts memory where it is
+    written to: so growing copies nothing. Where there are no such ranges, or none is left, the array is copied.
+    """
 
     paged = False
     """Whether parts of the array can leave memory."""
 
+    def __init__(self, room: int = 0) -> None:
+        """`room`: numbers that the array may grow to without being copied."""
+        self._room = room
+        self._range: mmap.mmap | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"_room": self._room, "_range": None}  # a copy of the array is an array of its own
+
     def grow(self, array: Float32, size: int) -> Float32:
         """Return an array of `size` numbers that begins with what `array` holds."""
-        grown: Float32 = np.empty(size, np.float32)
+        if self._range is not None and size <= self._room:
+            return np.frombuffer(self._range, np.float32, size)
+        self._range = _reserve(4 * self._room) if size <= self._room else None
+        grown: Float32
+        grown = np.empty(size, np.float32) if self._range is None else np.frombuffer(self._range, np.float32, size)
         grown[: len(array)] = array
         return grown
 
@@ -36,6 +54,24 @@ class Memory:
         """Say that parts of the array will not be needed for a while."""
 
 
+_NORESERVE = getattr(mmap, "MAP_NORESERVE", 0x4000 if sys.platform == "linux" else 0)
+"""Memory is not counted before it is used; other systems never do. Python has a name for it from 3.13 on."""
+
+
+def _reserve(size: int) -> mmap.mmap | None:
+    """Return a range of addresses without memory behind them yet; None where the system has none to give."""
+    if not hasattr(mmap, "MAP_ANONYMOUS"):
+        return None
+    try:
+        addresses = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS | _NORESERVE)
+    except (OSError, ValueError, OverflowError):  # a limit on addresses, or a system that counts them as memory
+        return None
+    if hasattr(mmap, "MADV_HUGEPAGE"):
+        with contextlib.suppress(OSError):  # a kernel without them
+            addresses.madvise(mmap.MADV_HUGEPAGE)
+    return addresses
+
+
 class MappedFile(Memory):
     """A file without a name in `folder` ("": the system's choice) that is mapped into memory, and gone with the object.
 
@@ -43,13 +79,15 @@ class MappedFile(Memory):
     of the process and come back by themselves when they are read. So no result can depend on what is where.
     """
 
-    def __init__(self, folder: str = "") -> None:
+    def __init__(self, folder: str = "", room: int = 0) -> None:
+        super().__init__(room)
         self._folder = folder
         self._file: int | None = None
         self._map: mmap.mmap | None = None
 
     def __getstate__(self) -> dict[str, Any]:
-        return {"_folder": self._folder, "_file": None, "_map": None}  # a copy of the map is in memory
+        # A copy of the map is in memory.
+        return {**super().__getstate__(), "_folder": self._folder, "_file": None, "_map": None}
 
     @property
     def paged(self) -> bool:  # type: ignore[override]

@@ -101,7 +101,7 @@ class PagePool(Stateful):
         self.config = config or MapConfig()
         self.total = 0
         budget = self.config.memory_budget_mb
-        self._backing = MappedFile(self.config.folder) if budget > 0 else Memory()
+        self._backing = MappedFile(self.config.folder, MOST_PAGES * SPAN) if budget > 0 else Memory(MOST_PAGES * SPAN)
         self._residence = Residence(self._backing, SHELF * SPAN, int(budget * 1e6 / 4))
         self._looks = 0
         self.corrections = Corrections()
@@ -446,9 +446,8 @@ class PagePool(Stateful):
         )
 
     def _next_capacity(self) -> int:
-        """How many pages there should be room for; a file grows without being copied, so by less at a time."""
-        more = max(self.capacity // 4, SHELF) if self._backing.paged else self.capacity
-        return max(min(self.capacity + more, MOST_PAGES), self.capacity + 1)
+        """How many pages there should be room for: of pages only their columns are copied, 45 bytes each."""
+        return max(min(self.capacity + max(self.capacity // 4, SHELF), MOST_PAGES), self.capacity + 1)
 
     def _grow(self, capacity: int) -> None:
         if capacity > MOST_PAGES:
