@@ -22,6 +22,7 @@ OPTIONS = {
     "register": "--method --scale --init --global --voxel --max-distance --set --threads --explain --plot --out --json",
     "evaluate": "--align --json --plot",
     "render": "--out --scene --path --path-frame --noise --frames --size --fps --seed --force",
+    "repeat": "--out --threads --force --json",
     "report": "--truth --out",
     "view": "--host --port",
     "mesh": "--out --voxel --frames --depth-max --fill-holes --from-surfels --splat --memory --threads --json",

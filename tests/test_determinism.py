@@ -13,6 +13,7 @@ import pytest
 
 import scanweld as sw
 from rendered import rendered, write_tum_folder
+from scanweld.runs.comparison import compare_runs
 
 
 @pytest.fixture(scope="module")
@@ -42,6 +43,7 @@ def test_same_bytes_in_fresh_processes_at_any_number_of_threads(recorded: Path, 
         done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
         assert done.returncode == 0, done.stderr
         assert json.loads((out / "run.json").read_text())["threads"] == threads
+        assert compare_runs(out, tmp_path / "run-0").different == {}  # frames.csv and metrics.json, too
         for name in files:
             seen[name].add((out / name).read_bytes())
     assert {name: len(contents) for name, contents in seen.items()} == dict.fromkeys(files, 1)

@@ -88,6 +88,13 @@ def kernels_are_cached(group: str, *, now: bool = False) -> bool:
     return note.exists()
 
 
+def processor() -> str:
+    """Name of the kind of processor that kernels are compiled for: others may round differently."""
+    from llvmlite import binding
+
+    return str(numba.core.config.CPU_NAME or binding.get_host_cpu_name())
+
+
 _num_threads = max(
     1, min(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1, 16)
 )

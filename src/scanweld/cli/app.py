@@ -25,6 +25,7 @@ from scanweld.cli.examples import examples_of
 from scanweld.cli.mesh import mesh
 from scanweld.cli.register import register
 from scanweld.cli.render import render
+from scanweld.cli.repeat import repeat
 from scanweld.cli.report import report
 from scanweld.cli.slam import slam
 from scanweld.cli.usage import help_of, in_plain_words
@@ -65,6 +66,7 @@ for command in (
     register,
     evaluate,
     render,
+    repeat,
     report,
     view,
     mesh,

@@ -25,6 +25,10 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
         ("scanweld render --out room --noise kinect", "a room as a Kinect sees it"),
         ("scanweld render --out tiny --size 160x120 --frames 20", "to try things"),
     ),
+    "repeat": (
+        ("scanweld repeat run", "does the same come of it?"),
+        ("scanweld repeat run --threads 1 --out again", "kept, to look at"),
+    ),
     "report": (
         ("scanweld report run", "make the page again"),
         ("scanweld report run --truth groundtruth.txt --out desk.html", "with the truth"),

@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from scanweld.datasets.base import RgbdSequence
     from scanweld.runs.run import RunSummary
     from scanweld.slam.system import SlamConfig
-    from scanweld.trajectory import Trajectory
 
 Option = typer.Option
 
@@ -94,6 +93,7 @@ def slam(
     from scanweld.datasets.intrinsics import parse_intrinsics
     from scanweld.datasets.open import open_sequence
     from scanweld.errors import ConfigError
+    from scanweld.runs.reopen import given_poses
 
     settings = load_config(config, overrides or [])
     with collected_warnings() as warnings:
@@ -111,12 +111,13 @@ def slam(
     if resume and out is None:
         raise ConfigError("--resume: --out RUN has to say which run is to be continued")
     folder = out or next_run_folder(opened.name)
-    given = None if poses is None else given_poses(opened, poses)
+    poses_from = poses if poses in (None, "truth") else str(Path(poses).resolve())
+    given = None if poses_from is None else given_poses(opened, poses_from)
     place = str(sequence if isinstance(opened, LiveSequence) else sequence.resolve())
     description = {
-        "input": place, "format": format_name, "frames": frames, "scale": scale, "poses": poses,
+        "input": place, "format": format_name, "frames": frames, "scale": scale, "poses": poses_from,
         "camera": camera, "depth_scale": depth_scale, "topics": topics, "config": str(config) if config else None,
-        "set": overrides or [], "calibrate": calibrate, "refine": refine, "warnings": warnings,
+        "set": overrides or [], "warnings": warnings,
     }  # fmt: skip
     with opened_observers(opened.name, view=view, host=view_host, port=view_port, rerun=rerun) as observers:
         summary = run_with_progress(
@@ -155,18 +156,6 @@ def load_config(path: Path | None, overrides: list[str]) -> SlamConfig:
     for text in overrides:
         values = merge(values, parse_override(text))
     return from_mapping(SlamConfig, values, "--set" if overrides else str(path))
-
-
-def given_poses(sequence: RgbdSequence, source: str) -> Trajectory:
-    """Return the true poses of a sequence, or those of a file."""
-    from scanweld.errors import DatasetError
-    from scanweld.io.trajectory_files import read_trajectory
-
-    if source != "truth":
-        return read_trajectory(source)
-    if sequence.ground_truth is None:
-        raise DatasetError(f"{sequence.name}: has no ground truth; --poses FILE takes a trajectory file")
-    return sequence.ground_truth
 
 
 def run_with_progress(

@@ -374,11 +374,14 @@ def _warnings(run: Mapping[str, Any]) -> str:
 
 
 def _environment(run: RunFiles) -> str:
-    told = {"warnings", "packages", "intrinsics", "name"}
+    told = {"warnings", "packages", "intrinsics", "name", "fingerprint"}
     rows = [(key, _value(value)) for key, value in run.run.items() if key not in told and value not in (None, [], "")]
     packages = run.run.get("packages")
     if isinstance(packages, dict):
         rows += [(str(key), str(value)) for key, value in packages.items()]
+    fingerprint = run.run.get("fingerprint")
+    if isinstance(fingerprint, dict):
+        rows.append(("checksum of the frames", str(fingerprint.get("content", ""))))
     camera = run.run.get("intrinsics")
     if isinstance(camera, dict):
         rows.append(("intrinsics", ", ".join(f"{key} {_value(value)}" for key, value in camera.items())))

@@ -135,7 +135,7 @@ def read_run_files(folder: Path, *, truth: Path | None = None) -> RunFiles:
         When the folder is no run folder, or one of its files cannot be read.
     """
     check_run_folder(folder, NEEDED)
-    run = _read_json(folder / "run.json")
+    run = read_json(folder / "run.json")
     frames = read_frames(folder / "frames.csv")
     if len(frames) == 0:
         raise FileFormatError(f"{folder / 'frames.csv'}: has no frame")
@@ -149,7 +149,7 @@ def read_run_files(folder: Path, *, truth: Path | None = None) -> RunFiles:
         trajectory=read_trajectory(folder / "trajectory.txt", "tum"),
         truth=read_trajectory(true_path) if truth or true_path.is_file() else None,
         surfels=read_ply_columns(folder / "map.ply"),
-        metrics=_numbers(_read_json(folder / "metrics.json")),
+        metrics=_numbers(read_json(folder / "metrics.json")),
         run=run,
         config_text=config_text,
         config=load_toml(config_path) if config_text else {},
@@ -214,6 +214,23 @@ def read_keyframes(path: Path) -> tuple[Int64, Int64]:
     return np.array([frame for frame, _ in rows], np.int64), np.array(loops, np.int64).reshape(-1, 2)
 
 
+def read_json(path: Path) -> Mapping[str, Any]:
+    """Return the object that a file of JSON holds.
+
+    Raises
+    ------
+    FileFormatError
+        When it is none.
+    """
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, ValueError) as error:
+        raise FileFormatError(f"{path}: not readable JSON: {error}") from None
+    if not isinstance(content, dict):
+        raise FileFormatError(f"{path}: expected a JSON object, got {type(content).__name__}")
+    return content
+
+
 def poses_of_frames(frames: FrameTable, trajectory: Trajectory) -> tuple[Float64, Bool]:
     """Return T_world_camera (N, 4, 4) of every frame, and whether trajectory.txt has it (N,).
 
@@ -233,13 +250,3 @@ def poses_of_frames(frames: FrameTable, trajectory: Trajectory) -> tuple[Float64
 def _numbers(values: Mapping[str, Any]) -> Mapping[str, Any]:
     """Leave out what is no finite number, so that nobody who shows a figure has to ask."""
     return {key: v for key, v in values.items() if isinstance(v, (int, float)) and math.isfinite(v)}
-
-
-def _read_json(path: Path) -> Mapping[str, Any]:
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, ValueError) as error:
-        raise FileFormatError(f"{path}: not readable JSON: {error}") from None
-    if not isinstance(content, dict):
-        raise FileFormatError(f"{path}: expected a JSON object, got {type(content).__name__}")
-    return content

@@ -28,7 +28,7 @@ from scanweld.io.ply import write_ply
 from scanweld.io.trajectory_files import write_tum
 from scanweld.mapping.rendering import render_picture
 from scanweld.mapping.surfel_map import SurfelMap
-from scanweld.parallel import get_num_threads
+from scanweld.parallel import get_num_threads, processor
 from scanweld.report.page import write_report
 from scanweld.report.plots import plot_path, plot_tracking
 from scanweld.slam.motion import trajectory_of
@@ -206,6 +206,7 @@ def _environment(config: SlamConfig) -> dict[str, Any]:
         "scanweld": version("scanweld"),
         "python": platform.python_version(),
         "platform": platform.platform(),
+        "processor": processor(),
         "packages": packages,
         "seed": config.seed,
         "threads": get_num_threads(),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,9 +17,10 @@ from scanweld.errors import DatasetError, FileFormatError
 from scanweld.geometry.camera import PinholeCamera
 from scanweld.io.trajectory_files import read_trajectory
 from scanweld.refinement.calibration import DepthCorrection
-from scanweld.report.run_files import FrameTable, check_run_folder, poses_of_frames, read_frames
+from scanweld.report.run_files import FrameTable, check_run_folder, poses_of_frames, read_frames, read_json
 from scanweld.runs.calibrated import CalibratedSequence
 from scanweld.runs.folder import MARK
+from scanweld.trajectory import Trajectory
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,14 +50,7 @@ def read_description(folder: Path) -> Mapping[str, Any]:
         When the folder is no run folder.
     """
     check_run_folder(folder, [MARK])
-    path = folder / MARK
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, ValueError) as error:
-        raise FileFormatError(f"{path}: not readable JSON: {error}") from None
-    if not isinstance(content, dict):
-        raise FileFormatError(f"{path}: expected a JSON object, got {type(content).__name__}")
-    return content
+    return read_json(folder / MARK)
 
 
 def posed_frames(folder: Path) -> PosedFrames:
@@ -88,21 +81,7 @@ def reopen_sequence(run: Mapping[str, Any]) -> RgbdSequence:
     FileFormatError
         When what run.json says of a calibration is not readable.
     """
-    if isinstance(run.get("render"), Mapping):  # a demo renders its sequence, and keeps what it rendered
-        return SyntheticSequence(from_mapping(RenderConfig, run["render"], MARK))
-    place = Path(str(run.get("input") or ""))
-    if not run.get("input") or not place.exists():
-        raise DatasetError(f"the sequence of the run is not there any more: {run.get('input') or 'it has no path'}")
-    options: dict[str, Any] = {"topics": run["topics"]} if run.get("topics") else {}
-    sequence = open_sequence(
-        place,
-        format=run.get("format") or "auto",
-        camera=parse_intrinsics(run["camera"]) if run.get("camera") else None,
-        depth_scale=run.get("depth_scale"),
-        frames=run.get("frames"),
-        scale=run.get("scale") or 1.0,
-        **options,
-    )
+    sequence = reopen_input(run)
     found = run.get("refinements")
     if run.get("calibrated") and found:
         try:
@@ -111,3 +90,39 @@ def reopen_sequence(run: Mapping[str, Any]) -> RgbdSequence:
             raise FileFormatError(f"{MARK}: the calibration of the run is not readable: {error}") from None
         return CalibratedSequence(sequence, camera, DepthCorrection(offset))
     return sequence
+
+
+def reopen_input(run: Mapping[str, Any]) -> RgbdSequence:
+    """Open the sequence of a run as the run began with it; parameters and errors as in :func:`reopen_sequence`."""
+    if isinstance(run.get("render"), Mapping):  # a demo renders its sequence, and keeps what it rendered
+        return SyntheticSequence(from_mapping(RenderConfig, run["render"], MARK))
+    place = Path(str(run.get("input") or ""))
+    if not run.get("input") or not place.exists():
+        raise DatasetError(f"the sequence of the run is not there any more: {run.get('input') or 'it has no path'}")
+    options: dict[str, Any] = {"topics": run["topics"]} if run.get("topics") else {}
+    return open_sequence(
+        place,
+        format=run.get("format") or "auto",
+        camera=parse_intrinsics(run["camera"]) if run.get("camera") else None,
+        depth_scale=run.get("depth_scale"),
+        frames=run.get("frames"),
+        scale=run.get("scale") or 1.0,
+        **options,
+    )
+
+
+def given_poses(sequence: RgbdSequence, source: str) -> Trajectory:
+    """Return the true poses of a sequence, where `source` is "truth", or those of a file.
+
+    Raises
+    ------
+    DatasetError
+        When the sequence has no true poses.
+    FileFormatError
+        When the file is no trajectory.
+    """
+    if source != "truth":
+        return read_trajectory(source)
+    if sequence.ground_truth is None:
+        raise DatasetError(f"{sequence.name}: has no ground truth; --poses FILE takes a trajectory file")
+    return sequence.ground_truth

@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from scanweld.arrays import Float32, Float64
+from scanweld.arrays import Float64
 from scanweld.datasets.base import LiveSequence, RgbdSequence
 from scanweld.datasets.gyroscope import gyroscope_of
 from scanweld.datasets.images import check_depth_unit, explain_unusable_depth
@@ -26,6 +26,7 @@ from scanweld.geometry.frame import Frame
 from scanweld.notebook import BAD, DOUBTFUL, GOOD, card
 from scanweld.refinement.refine import Refinement
 from scanweld.runs.calibrated import CalibratedSequence
+from scanweld.runs.checkpoint.identity import digest_of, fingerprint_of
 from scanweld.runs.checkpoint.keeper import Checkpoints
 from scanweld.runs.folder import check_writable, write_folder
 from scanweld.runs.interrupts import Patience
@@ -109,6 +110,7 @@ class _Tally:
     """What is counted while frames go by."""
 
     num_points_input: int = 0
+    content: int = 0  # checksum of what the frames show
     median_depth_m: float = 0.0  # of the first frame with depth
     unit_doubted: bool = False
     warnings: list[str] = field(default_factory=list)
@@ -117,8 +119,10 @@ class _Tally:
         logger.warning(message)
         self.warnings.append(message)
 
-    def count(self, index: int, depth_m: Float32, depth_scale: float) -> None:
+    def count(self, index: int, frame: Frame, depth_scale: float) -> None:
         """Count what a frame measured, and doubt the unit of the first ones once."""
+        depth_m = frame.depth_m
+        self.content = digest_of(frame, self.content)
         self.num_points_input += int(np.count_nonzero(depth_m))
         if index < UNIT_CHECK_FRAMES and not self.unit_doubted and depth_m.any():
             self.median_depth_m = float(np.median(depth_m[depth_m > 0]))
@@ -180,15 +184,18 @@ class _Run(Stateful):
         why = explain_unusable_depth(self.tally.median_depth_m, self.sequence.depth_scale, usable_m)
         raise DatasetError(f"{self.sequence.name}: no frame has usable depth, the map is empty; {why}")
 
-    def describe(self, description: Mapping[str, Any], *, calibrate: bool, realtime: bool) -> dict[str, Any]:
-        """Return a description with what became of the run; `calibrate`: whether that was asked for."""
+    def describe(
+        self, description: Mapping[str, Any], options: Mapping[str, bool], fingerprint: Mapping[str, Any]
+    ) -> dict[str, Any]:
+        """Return a description with what was asked for, what of, and what became of the run."""
         return {
             **description,
+            **options,
+            "fingerprint": {**fingerprint, "content": f"{self.tally.content:08x}"} if fingerprint else {},
             "warnings": [*description.get("warnings", ()), *self.tally.warnings],
             "interrupted": self.interrupted,
-            "realtime": realtime,
             **({"resumed_at": self.resumed_at} if self.resumed_at else {}),
-            **({"calibrated": isinstance(self.sequence, CalibratedSequence)} if calibrate else {}),
+            **({"calibrated": isinstance(self.sequence, CalibratedSequence)} if options["calibrate"] else {}),
             **({"refinements": described(self.refinements)} if self.refinements else {}),
         }
 
@@ -285,7 +292,7 @@ def run_sequence(
             if fault:
                 run.tally.warn(fault)
 
-        given = None if poses is None else _poses_by_frame(sequence, poses)
+        given = None if poses is None else poses_by_frame(sequence, poses)
         placed = _beside(config, out)
         run = _Run(sequence, placed, build_slam(sequence.camera, placed))
         kept_in = out if timeless else None
@@ -319,10 +326,12 @@ def run_sequence(
         metrics["seconds_total"] = time.perf_counter() - started
         resumable = False
         if out is not None:
+            asked = {"calibrate": calibrate, "refine": refine, "realtime": realtime, "tracked_only": tracked_only}
+            fingerprint = fingerprint_of(sequence, given) if timeless else {}
             with write_folder(out, force=force or resume) as aside:
                 write_run(
                     aside, run.slam, run.sequence, config, metrics, error, tracked_only=tracked_only, started=started,
-                    description=run.describe(description or {}, calibrate=calibrate, realtime=realtime),
+                    description=run.describe(description or {}, asked, fingerprint),
                 )  # fmt: skip
                 resumable = run.interrupted and checkpoints.keep_in(aside)
         results, refinements = tuple(run.slam.main_results), tuple(run.refinements)
@@ -364,7 +373,7 @@ def _process_all(
             elif given is not None and pose is None:
                 result = slam.skip(record.timestamp_s, "no given pose")
             else:
-                tally.count(record.index, record.frame.depth_m, sequence.depth_scale)
+                tally.count(record.index, record.frame, sequence.depth_scale)
                 result = slam.process(
                     record.frame,
                     pyramid=record.prepared,
@@ -374,7 +383,7 @@ def _process_all(
             after_frame(slam, record.frame, result)
 
 
-def _poses_by_frame(sequence: RgbdSequence, poses: Trajectory) -> list[Float64 | None]:
+def poses_by_frame(sequence: RgbdSequence, poses: Trajectory) -> list[Float64 | None]:
     """Return the given pose of each frame, None where there is none within 0.02 s."""
     if len(poses) == 0:
         raise InvalidInputError("poses: the trajectory is empty; give one pose per frame, or none to track")

@@ -31,22 +31,27 @@ def identity_of(sequence: RgbdSequence, config: SlamConfig, given: Sequence[Floa
     ----------
     given : T_world_camera (4, 4) of each frame at given poses, None for those that are left out
     """
-    gyroscope = gyroscope_of(sequence)
-    turned = None if gyroscope is None else gyroscope.orientations(sequence.timestamps_s)
     identity = {
         "scanweld": version("scanweld"),
         "backend": get_backend(),
-        "sequence": {
-            "number of frames": len(sequence),
-            "camera": asdict(sequence.camera),
-            "depth scale": sequence.depth_scale,
-            "timestamps": _digest([sequence.timestamps_s]),
-            "gyroscope": _digest(turned),
-            "given poses": _digest(given),
-        },
+        "sequence": fingerprint_of(sequence, given),
         "config": asdict(replace(config, map=MapConfig())),
     }
     return dict(json.loads(json.dumps(identity)))  # as it comes back from a file
+
+
+def fingerprint_of(sequence: RgbdSequence, given: Sequence[Float64 | None] | None) -> dict[str, Any]:
+    """Return what tells a sequence from others, all but what its frames show; `given` as in :func:`identity_of`."""
+    gyroscope = gyroscope_of(sequence)
+    turned = None if gyroscope is None else gyroscope.orientations(sequence.timestamps_s)
+    return {
+        "number of frames": len(sequence),
+        "camera": asdict(sequence.camera),
+        "depth scale": sequence.depth_scale,
+        "timestamps": _digest([sequence.timestamps_s]),
+        "gyroscope": _digest(turned),
+        "given poses": _digest(given),
+    }
 
 
 def check_identity(identity: Mapping[str, Any], stored: Mapping[str, Any], where: str) -> None:
@@ -69,10 +74,10 @@ def check_identity(identity: Mapping[str, Any], stored: Mapping[str, Any], where
         )
 
 
-def digest_of(frame: Frame) -> int:
-    """Return a checksum of what a frame shows."""
+def digest_of(frame: Frame, before: int = 0) -> int:
+    """Return a checksum of what a frame shows; with that of the frames before it, of them all."""
     color = b"" if frame.color is None else np.ascontiguousarray(frame.color).data
-    return zlib.crc32(color, zlib.crc32(np.ascontiguousarray(frame.depth_m).data))
+    return zlib.crc32(color, zlib.crc32(np.ascontiguousarray(frame.depth_m).data, before))
 
 
 def check_frames(sequence: RgbdSequence, digests: Sequence[Sequence[int]], where: str) -> None:
