@@ -195,6 +195,7 @@ class TestMapChanges:
         T = np.eye(4)
         T[0, 3] = 0.02
         surfels.apply_correction(sw.MapCorrection(np.array([0], np.int32), T[None]))
+        surfels.pages.follow(surfels.capacity)
         assert show(changes, surfels, pieces) == 20_000
         np.testing.assert_array_equal(drawn(pieces), everything(surfels))
 
@@ -250,10 +251,7 @@ class TestPath:
         before = positions.copy()
         moved = np.eye(4)
         moved[0, 3] = 1.0
-        slam._results = [
-            type(r)(index=r.index, timestamp_s=r.timestamp_s, state=r.state, T_world_camera=moved @ r.T_world_camera)
-            for r in slam.results
-        ]
+        slam._results.move(np.arange(len(slam.results)), np.tile(moved, (len(slam.results), 1, 1)))
         assert path.update(slam, None) == (False, True)
         np.testing.assert_allclose(path.drawn()[0], before + [1, 0, 0])
         np.testing.assert_array_equal(positions, before)  # what was given out does not change

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
@@ -28,6 +29,7 @@ from scanweld.parallel import limited_threads
 from scanweld.refinement.config import RefinementConfig
 from scanweld.refinement.refine import Refinement, refine_keyframes
 from scanweld.registration.result import RegistrationResult, Status
+from scanweld.slam.frame_log import FrameLog
 from scanweld.slam.health import HealthConfig, TrackingHealth, is_near
 from scanweld.slam.motion import POSED, UNSEEN, ConstantVelocity, trajectory_of
 from scanweld.slam.rotation_aid import RotationAid, as_rotation
@@ -76,10 +78,9 @@ class Slam(Stateful):
     """
 
     STATE: ClassVar = {
-        "loop_closer": Stateful, "atlas": Stateful, "_results": list[FrameResult],
-        "_num_surfels": int, "_uncounted": int,
-        "_keyframes": list[int], "_last_posed": int, "_health": Stateful, "_dynamics": Stateful | None,
-        "_moving": Bool | None, "_motion": Stateful, "_rotation": Stateful,
+        "loop_closer": Stateful, "atlas": Stateful, "_results": Stateful, "_num_surfels": int, "_uncounted": int,
+        "_last_posed": int, "_health": Stateful, "_dynamics": Stateful | None, "_moving": Bool | None,
+        "_motion": Stateful, "_rotation": Stateful,
     }  # fmt: skip
     MADE = frozenset({"tracker", "surfaces", "_T_world_first", "_last_tracked"})
 
@@ -99,10 +100,9 @@ class Slam(Stateful):
         self.loop_closer = loop_closer or NoLoopCloser()
         self.atlas = Atlas(mapper, self.loop_closer, submaps)
         self.surfaces = surfaces or SurfaceConfig()
-        self._results: list[FrameResult] = []
+        self._results = FrameLog()
         self._num_surfels = 0  # of the map at hand, as far as is known: see `_count`
         self._uncounted = 0  # the first frame whose map has not been counted
-        self._keyframes: list[int] = []  # that each result moves with
         self._last_posed = -1  # the frame that the camera was last tracked in
         self._health = TrackingHealth(health)
         self._dynamics = MotionDetector(dynamics) if dynamics else None
@@ -118,7 +118,7 @@ class Slam(Stateful):
         return self.atlas.mapper
 
     @property
-    def results(self) -> list[FrameResult]:
+    def results(self) -> Sequence[FrameResult]:
         """One per frame; each is of the submap that the camera was in."""
         self._count()
         return self._results
@@ -165,11 +165,6 @@ class Slam(Stateful):
         for mapper in self.atlas.mappers.values():
             if isinstance(mapper, DeferringMapper):
                 mapper.finish()
-
-    def restored(self) -> None:
-        """Check that the frames so far are numbered, each with its keyframe."""
-        if len(self._results) != len(self._keyframes) or any(r.index != k for k, r in enumerate(self._results)):
-            raise ValueError("the frames so far are not numbered")
 
     def prepare(self, frame: Frame) -> SurfacePyramid:
         """Compute the surfaces of a frame as `process` does, with the caller's thread alone.
@@ -290,7 +285,7 @@ class Slam(Stateful):
         database = getattr(self.loop_closer, "database", None)  # other loop closers may keep no keyframes
         main = main_submap(self._results)
         everything = () if database is None else database.keyframes
-        keyframes = [keyframe for keyframe in everything if self._results[keyframe.frame_index].submap == main]
+        keyframes = [keyframe for keyframe in everything if self._results.submap(keyframe.frame_index) == main]
         refined = refine_keyframes(keyframes, camera, config)
         if apply and refined.better and not refined.recalibrated and database is not None:
             poses = [keyframe.T_world_camera for keyframe in everything]
@@ -298,11 +293,9 @@ class Slam(Stateful):
                 poses[index] = pose
             database.move(poses)
             self.atlas.mappers[main].apply(refined.correction)
-            moved = refined.corrections_at(np.array([result.timestamp_s for result in self._results]))
-            self._results = [
-                replace(result, T_world_camera=T @ result.T_world_camera) if result.submap == main else result
-                for result, T in zip(self._results, moved, strict=True)
-            ]
+            mine = self._results.frames_in(main)
+            times_s = np.array([self._results[index].timestamp_s for index in mine])
+            self._results.move(mine, refined.corrections_at(times_s))
         return refined
 
     def _tracked(self, pyramid: SurfacePyramid, view: ModelView, predicted: Float64, moved: Bool | None) -> FrameResult:
@@ -383,8 +376,8 @@ class Slam(Stateful):
     def _count(self) -> None:
         """Note how large the map is after the last frame that was fused; a mapper that is still at it is waited for."""
         for index in range(self._uncounted, len(self._results)):
-            surfels = len(self.atlas.mappers[self._results[index].submap].map)
-            self._results[index] = replace(self._results[index], num_surfels=surfels)
+            surfels = len(self.atlas.mappers[self._results.submap(index)].map)
+            self._results.set_num_surfels(index, surfels)
         self._uncounted, self._num_surfels = len(self._results), len(self.mapper.map)
 
     def _close_loops(self, pyramid: SurfacePyramid, result: FrameResult) -> None:
@@ -417,18 +410,14 @@ class Slam(Stateful):
         T_other_here = aligned.T_target_source @ se3.inverse(T_world_camera)
         T = T_other_here if other == join.kept else se3.inverse(T_other_here)
         self._correct(self.atlas.join(replace(join, T_kept_joined=T)))
-        self._results = [replace(r, submap=join.kept) if r.submap == join.joined else r for r in self._results]
+        self._results.rename(join.joined, join.kept)
 
     def _correct(self, correction: MapCorrection) -> None:
         """Move the frames so far and the camera with their keyframes, as the map was."""
         if self._dynamics:
             self._dynamics.forget()
-        moved = dict(zip(correction.keyframe_ids.tolist(), correction.T_new_old, strict=True))
-        self._results = [
-            replace(result, T_world_camera=moved[keyframe] @ result.T_world_camera) if keyframe in moved else result
-            for result, keyframe in zip(self._results, self._keyframes, strict=True)
-        ]
-        now = moved.get(self.loop_closer.keyframe)
+        self._results.follow(correction)
+        now = next(iter(correction.T_new_old[correction.keyframe_ids == self.loop_closer.keyframe]), None)
         if now is not None:
             self._motion.move(now)
             self._rotation.move(now)
@@ -486,8 +475,7 @@ class Slam(Stateful):
     def _keep(self, result: FrameResult) -> FrameResult:
         result = replace(result, submap=self.atlas.active, num_surfels=self._num_surfels)
         self._last_posed = len(self._results) if result.state in POSED else self._last_posed
-        self._results.append(result)
-        self._keyframes.append(self.loop_closer.keyframe)
+        self._results.append(result, self.loop_closer.keyframe)
         return result
 
 
