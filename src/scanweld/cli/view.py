@@ -36,8 +36,8 @@ def view(
     with FinishedView(run, host, port) as shown:
         if shown.note:
             print(f"warning: no images of the camera: {shown.note}", file=sys.stderr)
-        print(f"view     {shown.url}\n         until Ctrl-C", file=sys.stderr, flush=True)
         with contextlib.suppress(KeyboardInterrupt):
+            print(f"view     {shown.url}\n         until Ctrl-C", file=sys.stderr, flush=True)
             shown.serve()
     return 0
 
