@@ -33,10 +33,10 @@ from scanweld.cli.progress import FrameProgress
 from scanweld.cli.slam import summary_text
 from scanweld.config import from_mapping
 from scanweld.datasets.synthetic.paths import built_in_path
-from scanweld.errors import FileFormatError, InvalidInputError, OutputError, ScanweldError
+from scanweld.errors import DatasetError, FileFormatError, InvalidInputError, OutputError, ScanweldError
 from scanweld.geometry import se3
 from scanweld.geometry.views import MapCorrection
-from scanweld.io.atomic import put_back
+from scanweld.io.leftovers import put_back
 from scanweld.loop_closure.loop_closer import KeyframeLoopCloser
 from scanweld.mapping.storage.pages import MapConfig
 from scanweld.runs.checkpoint import encoding, file, keeper
@@ -521,11 +521,12 @@ class TestFolder:
 
     def test_killed_between_the_two_renames(self, partial: Path) -> None:
         """The old folder had been moved aside, the new one was not yet in its place."""
-        partial.rename(partial.with_name(".run.k3j4_x.old"))
-        partial.with_name(".run.k3j4_x").mkdir()
-        put_back(partial, CHECKPOINT)
+        partial.rename(partial.with_name(".run.part-k3j4_x00.old"))
+        partial.with_name(".run.part-k3j4_x00").mkdir()
+        put_back(partial, [CHECKPOINT])
         assert (partial / CHECKPOINT).is_file()
         assert len(sw.run_sequence(short(), out=partial, resume=True).results) == 16
+        assert [path.name for path in partial.parent.iterdir()] == ["run"]
 
 
 class TestCommandLine:
@@ -549,7 +550,7 @@ class TestCommandLine:
 
 class TestWriting:
     def test_half_written_ones_are_removed_and_the_last_stays(self, partial: Path) -> None:
-        stray = partial / f".{CHECKPOINT}.a1b2c3"
+        stray = partial / f".{CHECKPOINT}.part-a1b2c3d4"
         stray.write_bytes(b"half")
         sw.run_sequence(short(), out=partial, resume=True, progress=Stop(7))
         assert not stray.exists()
@@ -570,6 +571,44 @@ class TestWriting:
         assert caplog.text.count("No space left on device") == 1
         assert_same_run(partial, uninterrupted)
         assert any("no checkpoint" in line for line in json.loads((partial / "run.json").read_text())["warnings"])
+
+    @pytest.mark.parametrize("code", [errno.ENOSPC, errno.EROFS])
+    def test_folder_that_cannot_be_written_in_the_end(
+        self, code: int, partial: Path, uninterrupted: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """The disk is full, or was mounted read-only, once the run is done: it goes on when there is room again."""
+
+        def fail(*_: object) -> None:
+            raise OSError(code, os.strerror(code))
+
+        with monkeypatch.context() as patch:
+            patch.setattr("scanweld.runs.output.write_frames", fail)
+            with pytest.raises(OutputError) as caught:
+                sw.run_sequence(short(), out=partial, resume=True, checkpoint_every_s=1e-9)
+        assert os.strerror(code) in str(caught.value)
+        assert "the last checkpoint is whole, and --resume goes on from there" in str(caught.value)
+        assert [path.name for path in partial.parent.iterdir()] == ["run"]
+        sw.run_sequence(short(), out=partial, resume=True)
+        assert json.loads((partial / "run.json").read_text())["resumed_at"] == [5, 16]
+        assert_same_run(partial, uninterrupted)
+
+    def test_vanished_input(self, tmp_path: Path) -> None:
+        """The disk with the recording is unplugged after frame 7: that is no frame that cannot be decoded."""
+        recorded = write_tum_folder(tmp_path / "recorded", short().with_frames({9: short().frames[8]}))
+        sw.run_sequence(sw.open_sequence(recorded), out=tmp_path / "whole")
+        gone, out = tmp_path / "gone", tmp_path / "run"
+
+        def unplug(result: FrameResult) -> None:
+            if result.index == 7:
+                recorded.rename(gone)
+
+        with pytest.raises(DatasetError, match=r"is the recording still there\?; the last checkpoint is whole"):
+            sw.run_sequence(sw.open_sequence(recorded), out=out, progress=unplug)
+        assert [path.name for path in out.iterdir()] == [CHECKPOINT]
+        gone.rename(recorded)
+        summary = sw.run_sequence(sw.open_sequence(recorded), out=out, resume=True)
+        assert summary.metrics["frames_unreadable"] == 0
+        assert_same_run(out, tmp_path / "whole")
 
     def test_as_often_as_it_costs_little(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         """With one that takes 3 s, the next is after 150 s: 2 %."""
@@ -606,6 +645,54 @@ def process() -> Iterator[Callable[..., subprocess.Popen[bytes]]]:
         one.wait()
 
 
+DYING = """
+import os, sys
+from pathlib import Path
+import scanweld as sw
+from scanweld.io import atomic
+from scanweld.runs import output
+recorded, out, moment = sys.argv[1:]
+calls = []
+
+def dying(call):
+    def counted(*arguments, **options):
+        calls.append(call)
+        if len(calls) == 3:
+            os._exit(9)
+        return call(*arguments, **options)
+    return counted
+
+if moment == "half written":
+    atomic.os.fsync = dying(os.fsync)
+elif moment == "not renamed":
+    Path.replace = dying(Path.replace)
+else:
+    calls += [None, None]
+    output.write_frames = dying(output.write_frames)
+sw.run_sequence(sw.open_sequence(recorded), out=Path(out), checkpoint_every_s=1e-9)
+"""
+
+
+@pytest.mark.parametrize(("moment", "kept"), [("half written", 1), ("not renamed", 2), ("in the run folder", 6)])
+def test_killed_while_writing(moment: str, kept: int, tmp_path: Path) -> None:
+    """A process ends while it writes the second checkpoint, before the third has its name, and in the run folder.
+
+    A checkpoint is brought to the disk by two calls, for the file and for its name: the third call is for the second.
+    """
+    recorded = write_tum_folder(tmp_path / "recorded", short().part(0, 6))
+    sw.run_sequence(sw.open_sequence(recorded), out=tmp_path / "whole")
+    out = tmp_path / "run"
+    command = [sys.executable, "-c", DYING, str(recorded), str(out), moment]
+    assert subprocess.run(command, check=False).returncode == 9
+    half = [*out.glob(".*.part-*"), *tmp_path.glob(".run.part-*")]
+    assert len(half) == 1
+    sw.run_sequence(sw.open_sequence(recorded), out=out, resume=True)
+    assert json.loads((out / "run.json").read_text())["resumed_at"] == [kept]
+    assert_same_run(out, tmp_path / "whole")
+    assert {path.name for path in tmp_path.iterdir()} == {"recorded", "run", "whole"}
+    assert not any(path.name.startswith(".") for path in out.iterdir())
+
+
 def test_killed_at_random_moments(process: Callable[..., subprocess.Popen[bytes]], tmp_path: Path) -> None:
     """SIGKILL, three times, while a checkpoint is written after every frame; resumed, it is the uninterrupted run."""
     sequence = short().with_frames({9: short().frames[8]})
@@ -624,7 +711,7 @@ def test_killed_at_random_moments(process: Callable[..., subprocess.Popen[bytes]
         time.sleep(choose.uniform(0, 0.15))
         running.kill()
         running.wait()
-        put_back(out, CHECKPOINT)
+        put_back(out, [CHECKPOINT])
         if (out / CHECKPOINT).exists():
             CheckpointFile(out / CHECKPOINT).__exit__()  # whole, whatever was being written
     if not (out / "run.json").exists():

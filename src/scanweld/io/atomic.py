@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import glob
 import os
 import shutil
 import tempfile
@@ -11,6 +10,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from scanweld.errors import OutputError
+from scanweld.io import leftovers
 
 
 def write_file(path: Path, content: bytes | Iterable[bytes], *, sync: bool = False) -> None:
@@ -26,14 +26,17 @@ def write_file(path: Path, content: bytes | Iterable[bytes], *, sync: bool = Fal
     """
     temporary = None
     try:
-        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", delete=False) as file:
-            temporary = Path(file.name)
-            file.writelines([content] if isinstance(content, bytes) else content)
-            if sync:
-                file.flush()
-                os.fsync(file.fileno())
-        temporary.chmod(0o666 & ~_umask())  # temporary files are private, results are not
-        temporary.replace(path)
+        leftovers.clear(path)
+        descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=leftovers.prefix_of(path))
+        temporary = Path(name)
+        with leftovers.held(temporary):
+            with open(descriptor, "wb") as file:
+                file.writelines([content] if isinstance(content, bytes) else content)
+                if sync:
+                    file.flush()
+                    os.fsync(file.fileno())
+            temporary.chmod(0o666 & ~_umask())  # temporary files are private, results are not
+            temporary.replace(path)
         if sync:
             _sync_folder(path.parent)
     except OSError as error:
@@ -46,6 +49,8 @@ def write_file(path: Path, content: bytes | Iterable[bytes], *, sync: bool = Fal
 def check_writable(folder: Path, *, force: bool, kind: str, mark: str) -> None:
     """Raise OutputError before any work is done when `folder` could not be written at the end.
 
+    What a killed process left half done there is put back or taken away (:mod:`scanweld.io.leftovers`).
+
     Parameters
     ----------
     folder : what :func:`write_folder` will make
@@ -57,13 +62,15 @@ def check_writable(folder: Path, *, force: bool, kind: str, mark: str) -> None:
     folder = folder.resolve()
     if Path.cwd().is_relative_to(folder):
         raise OutputError(f"{folder}: is or holds the current folder; choose another --out")
+    leftovers.put_back(folder, [mark])
+    leftovers.clear(folder)
     if folder.is_dir() and any(folder.iterdir()):
         if not force:
             raise OutputError(f"{folder}: exists and is not empty; --force replaces it, --out writes elsewhere")
         if not (folder / mark).is_file():
             raise OutputError(f"{folder}: not a {kind} (no {mark}), so --force will not replace it")
     with _parents(folder, keep=False):
-        _folder_beside(folder).rmdir()
+        shutil.rmtree(_folder_beside(folder), ignore_errors=True)
 
 
 @contextlib.contextmanager
@@ -82,9 +89,10 @@ def write_folder(folder: Path, *, force: bool, kind: str, mark: str) -> Iterator
     with _parents(folder, keep=True):
         aside = _folder_beside(folder)
         try:
-            yield aside
-            aside.chmod(0o777 & ~_umask())
-            _put_in_place(aside, folder)
+            with leftovers.held(aside):
+                yield aside
+                aside.chmod(0o777 & ~_umask())
+                _put_in_place(aside, folder)
         except OutputError as error:  # the one that asked knows nothing of the folder aside
             raise OutputError(str(error).replace(str(aside), str(folder))) from None
         except OSError as error:
@@ -94,21 +102,10 @@ def write_folder(folder: Path, *, force: bool, kind: str, mark: str) -> Iterator
             shutil.rmtree(aside, ignore_errors=True)
 
 
-def put_back(folder: Path, mark: str) -> None:
-    """Put a folder with a file `mark` back that was killed between the two renames of :func:`write_folder`."""
-    folder = folder.resolve()
-    if folder.exists() or not folder.parent.is_dir():
-        return
-    for old in folder.parent.glob(f".{glob.escape(folder.name)}.*.old"):
-        if (old / mark).is_file():
-            old.rename(folder)
-            return
-
-
 def _folder_beside(folder: Path) -> Path:
     """Make a hidden folder in the place where `folder` shall be; what keeps it from being made keeps `folder`, too."""
     try:
-        return Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+        return Path(tempfile.mkdtemp(prefix=leftovers.prefix_of(folder), dir=folder.parent))
     except OSError as error:
         error.filename = str(folder)
         raise
@@ -135,14 +132,17 @@ def _put_in_place(aside: Path, folder: Path) -> None:
     if not folder.exists():
         aside.rename(folder)
         return
-    old = aside.with_name(aside.name + ".old")
-    folder.rename(old)
-    try:
-        aside.rename(folder)
-    except OSError:
-        old.rename(folder)
-        raise
-    shutil.rmtree(old, ignore_errors=True)
+    old = aside.with_name(aside.name + leftovers.OLD)
+    with leftovers.held(folder):
+        folder.rename(old)
+        try:
+            aside.rename(folder)
+        except OSError:
+            old.rename(folder)
+            raise
+        with contextlib.suppress(OSError):
+            old = old.rename(aside)  # the new one is there: this one is to be put back no more
+        shutil.rmtree(old, ignore_errors=True)
 
 
 @contextlib.contextmanager

@@ -6,7 +6,7 @@ import contextlib
 from pathlib import Path
 
 from scanweld.errors import OutputError
-from scanweld.io import atomic
+from scanweld.io import atomic, leftovers
 
 KIND, MARK = "run folder", "run.json"
 
@@ -23,7 +23,12 @@ def next_run_folder(name: str, root: Path = Path("runs")) -> Path:
 
 
 def check_writable(folder: Path, *, force: bool, resume: bool = False) -> None:
-    """Raise OutputError before any work is done when a run could not be written to `folder` at the end."""
+    """Raise OutputError before any work is done when a run could not be written to `folder` at the end.
+
+    What a killed run left half done is put back or taken away.
+    """
+    leftovers.put_back(folder.resolve(), [CHECKPOINT, MARK])
+    leftovers.clear(folder / CHECKPOINT)  # a folder that holds nothing else is empty
     if (folder / CHECKPOINT).is_file() and not (force or resume):
         raise OutputError(f"{folder}: holds a run that was interrupted; --resume continues it, --force begins anew")
     atomic.check_writable(folder, force=force or resume, kind=KIND, mark=_mark(folder))

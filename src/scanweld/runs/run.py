@@ -19,7 +19,7 @@ from scanweld.datasets.gyroscope import gyroscope_of
 from scanweld.datasets.images import check_depth_unit, explain_unusable_depth
 from scanweld.datasets.playback import Clock, WallClock, play
 from scanweld.datasets.stream import stream
-from scanweld.errors import DatasetError, InvalidInputError
+from scanweld.errors import DatasetError, InvalidInputError, UnreadableFrameError
 from scanweld.evaluation.surface_metrics import compression_ratio
 from scanweld.evaluation.trajectory_metrics import AteResult, ate, rpe
 from scanweld.geometry.frame import Frame
@@ -248,7 +248,8 @@ def run_sequence(
     OutputError
         When `out` cannot be written; checked before any frame is read.
     DatasetError
-        When no frame can be decoded.
+        When no frame can be decoded, or the recording has vanished meanwhile; a checkpoint of what was done by then is
+        written.
     FileFormatError, ConfigError
         When the checkpoint to resume from is damaged, of another version, or of another configuration.
     InvalidInputError
@@ -302,23 +303,27 @@ def run_sequence(
             started -= checkpoints.seconds_before
         elif resume:
             logger.warning("%s: there is no checkpoint to resume from; the run begins at the first frame", out)
-        try:
-            if realtime:
-                load_kernels()
-            played_by = (clock or WallClock()) if realtime else None
-            _process_all(run.slam, sequence, run.tally, given, after_frame, played_by)
-            run.slam.finish()
-            if calibrate or refine:
-                keep(run.slam, -1, None, surely=True)
-            if calibrate:
-                run.calibrate(after_frame)
-            if refine:
-                run.refine()
-        except KeyboardInterrupt:
-            if not run.tracked:
-                raise  # there is nothing to keep
-            if not isinstance(sequence, LiveSequence):  # which has no other end
-                run.interrupt()
+        with checkpoints.told_in_errors():
+            try:
+                if realtime:
+                    load_kernels()
+                played_by = (clock or WallClock()) if realtime else None
+                _process_all(run.slam, sequence, run.tally, given, after_frame, played_by)
+                run.slam.finish()
+                if calibrate or refine:
+                    keep(run.slam, -1, None, surely=True)
+                if calibrate:
+                    run.calibrate(after_frame)
+                if refine:
+                    run.refine()
+            except DatasetError:
+                keep(run.slam, -1, None, surely=run.tracked)
+                raise
+            except KeyboardInterrupt:
+                if not run.tracked:
+                    raise  # there is nothing to keep
+                if not isinstance(sequence, LiveSequence):  # which has no other end
+                    run.interrupt()
         for observer in observers:
             observer.on_end(run.slam)
         run.check_map()
@@ -328,7 +333,7 @@ def run_sequence(
         if out is not None:
             asked = {"calibrate": calibrate, "refine": refine, "realtime": realtime, "tracked_only": tracked_only}
             fingerprint = fingerprint_of(sequence, given) if timeless else {}
-            with write_folder(out, force=force or resume) as aside:
+            with checkpoints.told_in_errors(), write_folder(out, force=force or resume) as aside:
                 write_run(
                     aside, run.slam, run.sequence, config, metrics, error, tracked_only=tracked_only, started=started,
                     description=run.describe(description or {}, asked, fingerprint),
@@ -362,8 +367,16 @@ def _process_all(
         source = stream(sequence, 2, prepare=slam.prepare, first=len(slam.results))
     else:
         source = play(sequence, prepare=slam.prepare, clock=clock)
+    last_read: int | None = None
     with contextlib.closing(source) as records:
         for record in records:
+            if record.frame is not None:
+                last_read = record.index
+            elif not record.dropped and last_read is not None and not _can_be_read(sequence, last_read):
+                raise DatasetError(
+                    f"{sequence.name}: frame {record.index} cannot be read ({record.error}), and frame {last_read} "
+                    "not any more; is the recording still there?"
+                )
             pose = given[record.index] if given is not None else None
             if record.dropped:
                 result = slam.drop(record.timestamp_s, record.error)
@@ -381,6 +394,14 @@ def _process_all(
                     orientation=None if turned is None else turned[record.index],
                 )
             after_frame(slam, record.frame, result)
+
+
+def _can_be_read(sequence: RgbdSequence, index: int) -> bool:
+    try:
+        sequence.read(index)
+    except UnreadableFrameError:
+        return False
+    return True
 
 
 def poses_by_frame(sequence: RgbdSequence, poses: Trajectory) -> list[Float64 | None]:

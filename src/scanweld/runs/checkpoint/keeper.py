@@ -11,9 +11,8 @@ from pathlib import Path
 
 from scanweld.arrays import Float64
 from scanweld.datasets.base import RgbdSequence
-from scanweld.errors import FileFormatError, InvalidInputError, OutputError
+from scanweld.errors import DatasetError, FileFormatError, InvalidInputError, OutputError
 from scanweld.geometry.frame import Frame
-from scanweld.io.atomic import put_back
 from scanweld.runs.checkpoint import encoding, file
 from scanweld.runs.checkpoint.identity import check_frames, check_identity, digest_of, identity_of
 from scanweld.runs.folder import CHECKPOINT, MARK
@@ -70,7 +69,6 @@ class Checkpoints:
         """
         if self.path is None:
             raise InvalidInputError("resume: there is no run folder to resume from")
-        put_back(self.path.parent, CHECKPOINT)
         if not self.path.is_file():
             if (self.path.parent / MARK).is_file():
                 raise InvalidInputError(f"{self.path.parent}: the run is finished, there is nothing to resume")
@@ -110,7 +108,7 @@ class Checkpoints:
         header = {**self._identity, "shown": self._shown, "seconds": seconds}
         fault = ""
         try:
-            self._clear_folder(self.path.parent)
+            self.path.parent.mkdir(parents=True, exist_ok=True)
             file.write(self.path, header, encoding.encode(run, Stateful))
         except (OSError, OutputError) as error:
             fault = "" if self._has_warned else f"no checkpoint: {error}; the run goes on, and what was there is kept"
@@ -118,6 +116,16 @@ class Checkpoints:
         self._written = time.perf_counter()
         self._cost_s = self._written - begun
         return fault
+
+    @contextlib.contextmanager
+    def told_in_errors(self) -> Iterator[None]:
+        """Say in errors of the input and the output that there is a checkpoint to go on from, where there is one."""
+        try:
+            yield
+        except (DatasetError, OutputError) as error:
+            if self.path is None or not self.path.is_file():
+                raise
+            raise type(error)(f"{error}; the last checkpoint is whole, and --resume goes on from there") from None
 
     @property
     def _due(self) -> bool:
@@ -136,13 +144,6 @@ class Checkpoints:
         except OSError:  # a file system without links
             shutil.copyfile(self.path, folder / CHECKPOINT)
         return True
-
-    @staticmethod
-    def _clear_folder(folder: Path) -> None:
-        """Make the folder; take away what a killed process was about to write."""
-        folder.mkdir(parents=True, exist_ok=True)
-        for half_written in folder.glob(f".{CHECKPOINT}.*"):
-            half_written.unlink(missing_ok=True)
 
 
 @contextlib.contextmanager
