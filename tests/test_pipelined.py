@@ -75,6 +75,30 @@ class TestPipelined:
         slow.may_fuse.set()
         assert seen is expected
 
+    def test_a_look_waits_for_fusion_and_nobody_for_the_look(self) -> None:
+        """It sees the frame that was being fused, not the next one, and what moves the map waits for it."""
+        slow = SlowMapper()
+        mapper, two, order = PipelinedMapper(slow), frames(2), []
+        slow.may_fuse.clear()
+        mapper.fuse(*two[0])
+        mapper.look(lambda surfels: order.append(len(surfels)))
+        assert order == []
+        slow.may_fuse.set()
+        after_one = len(mapper.map)
+        assert order == [after_one] != [0]
+        mapper.fuse(*two[1])
+        mapper.look(lambda surfels: order.append(len(surfels)))
+        mapper.apply(sw.MapCorrection(np.array([0], np.int32), np.eye(4)[None]))
+        assert len(order) == 2
+
+    def test_what_fusion_raises_is_raised_after_a_look(self) -> None:
+        mapper, looked = PipelinedMapper(BrokenMapper()), []
+        mapper.fuse(*frames(1)[0])
+        mapper.look(looked.append)
+        with pytest.raises(MemoryError, match="no room"):
+            _ = mapper.map
+        assert looked == []
+
     def test_view_of_a_young_map_is_waited_for(self) -> None:
         """Most of it is unstable, and changes much with each frame."""
         mapper, plain = PipelinedMapper(SurfelMapper()), SurfelMapper()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import http.client
 import os
 import signal
@@ -11,6 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,8 +20,9 @@ import pytest
 import scanweld as sw
 from rendered import rendered
 from scanweld.errors import FileFormatError, InvalidInputError
+from scanweld.mapping.storage.pages import MapConfig
 from scanweld.mapping.surfel_map import SurfelMap
-from scanweld.viewer.changes import GROUP, MapChanges, Piece
+from scanweld.viewer.changes import GROUP, REFRESH_S, MapChanges, Piece
 from scanweld.viewer.coloring import Coloring, age_colors, confidence_colors, normal_colors, ramp
 from scanweld.viewer.guard import Guard, is_loopback
 from scanweld.viewer.panel import Gate
@@ -121,7 +124,7 @@ class TestGate:
 
 def wall(count: int, *, z: float = 2.0, frame: int = 0, seed: int = 0, surfels: SurfelMap | None = None) -> SurfelMap:
     """A map of a red wall of 4 m x 4 m at depth `z`, or a given one with such a wall added."""
-    surfels = surfels or SurfelMap(256)
+    surfels = SurfelMap(256) if surfels is None else surfels
     rng = np.random.default_rng(seed)
     positions = np.vstack([rng.uniform(-2, 2, (2, count)), np.full((1, count), z)]).astype(np.float32)
     normals = np.repeat(np.float32([[0], [0], [-1]]), count, axis=1)
@@ -198,6 +201,40 @@ class TestMapChanges:
         surfels.pages.follow(surfels.capacity)
         assert show(changes, surfels, pieces) == 20_000
         np.testing.assert_array_equal(drawn(pieces), everything(surfels))
+
+    def test_a_small_change_waits_for_its_turn(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """A twentieth of a piece, or that the camera looks there, is shown after `REFRESH_S`; a tenth at once."""
+        surfels, changes, pieces = wall(40_000), MapChanges(MANY), {}
+        show(changes, surfels, pieces)
+        planes = np.tile([[0.0, 0.0, 0.0, 1.0]], (6, 1))  # everything is on their inner sides
+        surfels.remove(np.arange(40_000) % 20 == 0)
+        assert changes.take(surfels, Coloring.RGB, MANY, planes) is None
+        surfels.remove(np.arange(38_000) % 10 == 0)
+        show(changes, surfels, pieces)
+        np.testing.assert_array_equal(drawn(pieces), everything(surfels))
+        assert changes.take(surfels, Coloring.RGB, MANY, planes) is None
+        monkeypatch.setattr(time, "monotonic", lambda now=time.monotonic: now() + REFRESH_S)
+        assert show(changes, surfels, pieces) == len(surfels)
+        assert changes.take(surfels, Coloring.RGB, MANY) is None
+
+    def test_what_waits_on_disk_stays_there(self, tmp_path: Path) -> None:
+        """A megabyte holds one shelf: of a larger map that moved only what is in memory is shown anew."""
+        surfels = SurfelMap(256, MapConfig(memory_budget_mb=1.0, folder=str(tmp_path)))
+        for k in range(3):
+            wall(20_000, z=2.0 * k, seed=k, surfels=surfels)
+        changes, pieces = MapChanges(MANY), {}
+        show(changes, surfels, pieces)
+        T = np.eye(4)
+        T[0, 3] = 0.02
+        surfels.apply_correction(sw.MapCorrection(np.array([0], np.int32), T[None]))
+        held = surfels.pages.in_memory
+        assert 0 < np.count_nonzero(held) < len(held)
+        pages = changes.take(surfels, Coloring.RGB, MANY, in_memory=True)
+        assert pages is not None
+        assert held[pages.numbers].all()
+        np.testing.assert_array_equal(surfels.pages.in_memory, held)
+        show(changes, surfels, pieces)
+        assert sum(len(piece.positions_m) for piece in pieces.values()) == 60_000
 
     def test_a_map_that_is_too_large_is_thinned(self) -> None:
         """25,000 points of 100,000 surfels: every fourth of each page, a last part of a page counting as a whole."""
@@ -365,22 +402,59 @@ class TestServer:
         with pytest.raises(InvalidInputError, match=r"view host '192\.0\.2\.1': nothing can listen there"):
             LiveView("192.0.2.1")
 
-    def test_a_run_goes_by_without_a_browser(self, live, capsys: pytest.CaptureFixture[str]) -> None:  # type: ignore[no-untyped-def]
+    def test_a_run_is_watched(self, live, capsys: pytest.CaptureFixture[str]) -> None:  # type: ignore[no-untyped-def]
         """Paused and stepped by the gate; in the end all of the map is drawn, and nothing was printed."""
-        sequence = rendered(count=6)
         live.gate.pause(True)
-        done: list[sw.RunSummary] = []
-        run = threading.Thread(target=lambda: done.append(sw.run_sequence(sequence, observers=[live])), daemon=True)
-        run.start()
-        until(lambda: live._run_panel._frame.value != "waiting")
-        assert live._run_panel._frame.value.startswith("0 ·")
-        live.gate.step()
-        until(lambda: live._run_panel._frame.value.startswith("1 ·"))
-        live.gate.pause(False)
-        run.join(60)
-        until(lambda: sum(len(h.points) for h in live._scene._pieces.values()) == len(done[0].map))
-        until(lambda: live._run_panel._pause.disabled)
+        with looking_on(live.url):
+            done: list[sw.RunSummary] = []
+            run = threading.Thread(
+                target=lambda: done.append(sw.run_sequence(rendered(count=6), observers=[live])), daemon=True
+            )
+            run.start()
+            until(lambda: live._run_panel._frame.value != "waiting")
+            assert live._run_panel._frame.value.startswith("0 ·")
+            until(lambda: num_points(live) > 0)  # also while it is held
+            live.gate.step()
+            until(lambda: live._run_panel._frame.value.startswith("1 ·"))
+            live.gate.pause(False)
+            run.join(60)
+            until(lambda: num_points(live) == len(done[0].map))
+            until(lambda: live._run_panel._pause.disabled)
         assert capsys.readouterr().out == ""
+
+    def test_nothing_is_drawn_for_nobody(self, live) -> None:  # type: ignore[no-untyped-def]
+        """Who comes when the run is over sees all of it."""
+        summary = sw.run_sequence(rendered(count=6), observers=[live])
+        time.sleep(0.3)
+        assert not live.watched
+        assert num_points(live) == 0
+        assert live._scene._frustum is None
+        with looking_on(live.url):
+            until(lambda: num_points(live) == len(summary.map))
+            until(lambda: live._run_panel._frame.value.startswith("5 ·"))
+            assert live._scene._path_length == 6
+            assert live.watched
+        until(lambda: not live.watched)
+
+
+def num_points(live: Any) -> int:
+    return sum(len(piece.points) for piece in live._scene._pieces.values())
+
+
+@contextlib.contextmanager
+def looking_on(url: str) -> Iterator[None]:
+    """Be connected to a view as a browser is, which says where it stands."""
+    import msgspec
+    import viser
+    from viser._messages import ViewerCameraMessage
+    from websockets.sync.client import connect
+
+    stands = ViewerCameraMessage((1, 0, 0, 0), (0, 0, 0), 1.0, 0.1, 1e3, 480, 640, (0, 0, 1), (0, -1, 0))
+    with connect(
+        url.replace("http", "ws", 1), subprotocols=[f"viser-v{viser.__version__}"], max_size=None, compression=None
+    ) as socket:
+        socket.send(msgspec.msgpack.encode(stands.as_serializable_dict([])))
+        yield
 
 
 @pytest.mark.parametrize(

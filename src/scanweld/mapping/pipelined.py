@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from concurrent.futures import Future, wait
 from dataclasses import replace
 from typing import Any, ClassVar
@@ -56,6 +57,19 @@ class PipelinedMapper(Stateful):
     def map(self) -> SurfelMap:
         """The map, with all frames fused; to be asked for anew after the next one, which changes it from behind."""
         return self.settled.map
+
+    def look(self, call: Callable[[SurfelMap], object]) -> None:
+        """Call with the map once all frames are fused, without waiting for that; what changes the map next waits."""
+        fusing, mapper = self._fusing, self._mapper
+        if fusing is None:
+            call(mapper.map)
+            return
+
+        def look() -> None:
+            fusing.result()  # has ended: what runs in the background takes turns
+            call(mapper.map)
+
+        self._fusing = in_background(look)
 
     def view(self, T_world_camera: Float64, camera: PinholeCamera) -> ModelView:
         """Return the map as a camera at `T_world_camera`, or close by, sees it or saw it one frame before the last."""

@@ -129,7 +129,8 @@ class FinishedView:
     def _draw_frame(self, k: int) -> None:
         frames = self._run.frames
         lost = ~self._posed
-        self._scene.show_camera(self._poses[k], self._camera, self._image(int(frames.number[k])), lost=bool(lost[k]))
+        self._scene.show_camera(self._poses[k], self._camera, lost=bool(lost[k]))
+        self._scene.show_image(self._image(int(frames.number[k])))
         self._scene.show_path(self._poses[: k + 1, :3, 3], lost[: k + 1])
         note = f": {frames.note[k]}" if frames.note[k] else ""
         self._timeline.tell(f"{frames.number[k]} · {frames.timestamp_s[k]:.2f} s", frames.state[k].upper() + note)

@@ -210,6 +210,11 @@ class PagePool(Stateful):
     def _memory_mb(self, shelves: int) -> float:
         return 4e-6 * (shelves * SHELF * SPAN if self._backing.paged else len(self.pool))
 
+    @property
+    def in_memory(self) -> Bool:
+        """Which shelves (S,) are in memory."""
+        return self._residence.held if self._backing.paged else np.ones(len(self.shelves), np.bool_)
+
     def page(self, slot: int) -> Float32:
         """Return the rows (ROWS, count) of a page, a view."""
         return self.pool.reshape(-1, ROWS, STRIDE)[slot, :, : self.counts[slot]]

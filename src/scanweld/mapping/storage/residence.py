@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from scanweld.arrays import Array, Int64
+from scanweld.arrays import Array, Bool, Int64
 from scanweld.mapping.storage.backing import Memory
 
 
@@ -32,6 +32,11 @@ class Residence:
         self._used: Int64 = np.empty(
             0, np.int64
         )  # the turn in which each shelf was used last, -1 for one not in memory
+
+    @property
+    def held(self) -> Bool:
+        """Which shelves (S,) are in memory."""
+        return self._used >= 0
 
     def grow(self, shelves: int) -> None:
         """Know of so many shelves; new ones are not in memory before they are used."""
