@@ -9,6 +9,8 @@ import scanweld as sw
 from rendered import CAMERA, frame_of, plane_depth, rendered
 from scanweld.datasets.synthetic import NOISE_MODELS, degrade_depth
 from scanweld.geometry import se3
+from scanweld.geometry.depth import intrinsics_array
+from scanweld.registration import kernels
 from scanweld.registration.verification import SAMPLES, check_against_depth, noise_directions
 from scanweld.tracking.two_frames import surface_points
 
@@ -131,6 +133,23 @@ class TestNoiseDirections:
         free = self.free_of(depth, noise)
         assert free.shape == (6, 1)
         assert abs(free[1, 0]) > 0.99
+
+    def test_slopes_of_both_sides(self) -> None:
+        """A point at (0.2, 0, 1) with normal (0, 0, -1) before a wall at 1.05 m whose normal is (0.6, 0, -0.8); the arm
+        from (0, 0, 1) over the radius 0.5 is (0.4, 0, 0), so the turns are a x n = (0, 0.4, 0) and (0, 0.32, 0). One at
+        0.8 m is too far in front, one behind the camera is not seen."""
+        surface = np.zeros((*CAMERA.shape, 8), np.float32)
+        surface[..., 2], surface[..., 3:6], surface[..., 6] = 1.05, [0.6, 0, -0.8], 20
+        points = np.array([[0, 0, 0.8], [0.2, 0, 1], [0.2, 0, -1]], np.float32).T.copy()
+        normals = np.array([[0, 0, -1]] * 3, np.float32).T.copy()
+        pairs = np.full((13, 4), np.nan, np.float32)
+        found = kernels.slope_pairs(
+            points, normals, np.eye(4, dtype=np.float32)[:3], surface.reshape(-1, 8), intrinsics_array(CAMERA),
+            CAMERA.width, CAMERA.height, np.array([0, 0, 1], np.float32), np.float32(2), np.float32(0.1), pairs,
+        )  # fmt: skip
+        assert found == 1
+        expected = [0, 0, -1, 0, 0.4, 0, 0.6, 0, -0.8, 0, 0.32, 0, 400]
+        np.testing.assert_allclose(pairs[:, 0], expected, rtol=1e-5, atol=1e-6)
 
     def test_nothing_to_compare_constrains_nothing(self) -> None:
         none = np.zeros((3, 0), np.float32)

@@ -170,6 +170,35 @@ def point_to_plane_sums(
 
 
 @kernel
+def slope_pairs(positions, normals, transform, target, intrinsics, width, height, centre, inverse_radius, reach, pairs):
+    """List the slopes of both sides for every point within `reach` [m] of a surface in depth; returns how many.
+
+    pairs (13, N): [n, a x n] of the point's normal; the same of the surface's; 1 / variance of the depth. The arm a is
+    that from the `centre`, over the radius. The rest as for `point_to_plane_sums`.
+    """
+    moved, pixels, surface = np.empty(6 * BLOCK, np.float32), np.empty(BLOCK, np.int32), np.empty(7 * BLOCK, np.float32)
+    total, found = positions.shape[1], 0
+    for first in range(0, total, BLOCK):
+        count = min(BLOCK, total - first)
+        project_block(first, count, positions, normals, transform, intrinsics, width, height, moved, pixels)
+        gather_surface(count, pixels, target, surface)
+        for k in range(count):
+            x, y = (moved[k] - centre[0]) * inverse_radius, (moved[k + BLOCK] - centre[1]) * inverse_radius
+            z = (moved[k + 2 * BLOCK] - centre[2]) * inverse_radius
+            for side in range(2):
+                normal = surface if side else moved
+                a, b, c = normal[k + 3 * BLOCK], normal[k + 4 * BLOCK], normal[k + 5 * BLOCK]
+                row = 6 * side
+                pairs[row, found], pairs[row + 1, found], pairs[row + 2, found] = a, b, c
+                pairs[row + 3, found], pairs[row + 4, found] = y * c - z * b, z * a - x * c
+                pairs[row + 5, found] = x * b - y * a
+            s = surface[k + 6 * BLOCK]
+            pairs[12, found] = s * s
+            found += (s > 0) & (abs(surface[k + 2 * BLOCK] - moved[k + 2 * BLOCK]) < reach)
+    return found
+
+
+@kernel
 def compare_with_depth(positions, normals, transform, target, intrinsics, width, height, counts):
     """Count (4,) how many points land on a surface, and how many of them are on it, in front of it and behind it.
 

@@ -284,9 +284,10 @@ def _descend(
     coarsest = len(target) - 1
     end = _Descent(T_target_source, [], None, False, positions_m, normals, np.zeros(3), 1.0)
     for level, stride in _stages(positions_m.shape[1], coarsest, config):
-        end.stride = stride
-        end.positions_m = np.ascontiguousarray(positions_m[:, ::stride])
-        end.normals = np.ascontiguousarray(normals[:, ::stride])
+        if stride != end.stride:
+            end.positions_m = np.ascontiguousarray(positions_m[:, ::stride])
+            end.normals = np.ascontiguousarray(normals[:, ::stride])
+            end.stride = stride
         few = end.positions_m[:, :: max(1, end.positions_m.shape[1] // 1000)]
         end.centroid_m, end.radius_m = _centroid_and_radius(se3.transform_points(end.T_target_source, few.T))
         gate = config.fine_gate_m * (config.coarse_gate_m / config.fine_gate_m) ** (level / max(coarsest, 1))

@@ -77,13 +77,8 @@ def check_against_depth(
     A point agrees when it is within four standard deviations of the surface's plane, within 0.1 m in depth, and its
     normal within 60 degrees; what does not is in front or behind from six standard deviations and 5 cm in depth on.
     """
-    stride = max(1, positions_m.shape[1] // SAMPLES)
     counts = np.empty(4, np.int64)
-    kernels.compare_with_depth(
-        np.ascontiguousarray(positions_m[:, ::stride]), np.ascontiguousarray(normals[:, ::stride]),
-        T_target_source[:3].astype(np.float32), target.surface.reshape(-1, 8), intrinsics_array(target.camera),
-        target.camera.width, target.camera.height, counts,
-    )  # fmt: skip
+    kernels.compare_with_depth(*_sampled(positions_m, normals, T_target_source, target), counts)
     compared, *shares = counts.tolist()
     return Agreement(compared, *(share / max(1, compared) for share in shares))
 
@@ -109,16 +104,16 @@ def noise_directions(
     positions_m, normals, T_target_source, target : as for :func:`check_against_depth`
     centroid_m, radius_m : pivot in the target frame and size; columns are twists about it, rotations times the radius
     """
-    p, n, q = (side.astype(np.float64) for side in _pairs(positions_m, normals, T_target_source, target))
+    points, *others = _sampled(positions_m, normals, T_target_source, target)
+    pairs = np.empty((13, points.shape[1] + 1), np.float32)
     # Partners are chosen by their place alone: choosing by the normals would make their noise alike.
-    near = np.abs(q[2] - p[2]) < 0.1
-    p, n, q = p[:, near], n[:, near], q[:, near]
-    if p.shape[1] == 0:
+    found = kernels.slope_pairs(
+        points, *others, centroid_m.astype(np.float32), np.float32(1 / radius_m), np.float32(0.1), pairs
+    )
+    if found == 0:
         return np.eye(6)
-    weights = q[6] ** 2 / (q[6] ** 2).sum()
-    arm = (p.T - centroid_m) / radius_m
-    slopes = np.concatenate([n, np.cross(arm, n.T).T])
-    target_slopes = np.concatenate([q[3:6], np.cross(arm, q[3:6].T).T])
+    slopes, target_slopes, (weights,) = np.split(pairs[:, :found].astype(np.float64), [6, 12])
+    weights /= weights.sum()
     product = (slopes * weights) @ target_slopes.T
     values, vectors = np.linalg.eigh((product + product.T) / 2)
     seen, seen_by_target = vectors.T @ slopes, vectors.T @ target_slopes
@@ -128,26 +123,12 @@ def noise_directions(
     return np.asarray(vectors[:, free])
 
 
-def _pairs(
+def _sampled(
     positions_m: Float32, normals: Float32, T_target_source: Float64, target: SurfaceLevel
-) -> tuple[Float32, Float32, Float32]:
-    """Sample the points that project onto a pixel with a surface.
-
-    Returns the points and normals (3, M), target frame, and the surface (8, M) behind their pixels.
-    """
+) -> tuple[Float32, Float32, Float32, Float32, Float32, int, int]:
+    """Return what the kernels take of a sample of the points, of the motion, and of the target."""
     stride = max(1, positions_m.shape[1] // SAMPLES)
-    rotation, translation = (
-        T_target_source[:3, :3].astype(np.float32),
-        T_target_source[:3, 3].astype(np.float32),
-    )
-    p = rotation @ positions_m[:, ::stride] + translation[:, None]
-    n = rotation @ normals[:, ::stride]
-    camera = target.camera
-    z = np.maximum(p[2], np.float32(1e-6))
-    u = np.floor(camera.fx * p[0] / z + camera.cx + 0.5)
-    v = np.floor(camera.fy * p[1] / z + camera.cy + 0.5)
-    inside = (p[2] > 0.01) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
-    p, n = p[:, inside], n[:, inside]
-    q = target.surface[v[inside].astype(np.int64), u[inside].astype(np.int64)].T
-    valid = q[6] > 0
-    return p[:, valid], n[:, valid], q[:, valid]
+    positions_m, normals = (np.ascontiguousarray(side[:, ::stride]) for side in (positions_m, normals))
+    transform, camera = T_target_source[:3].astype(np.float32), target.camera
+    surface = target.surface.reshape(-1, 8)
+    return positions_m, normals, transform, surface, intrinsics_array(camera), camera.width, camera.height

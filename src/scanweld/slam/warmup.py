@@ -23,6 +23,7 @@ from scanweld.mapping.mapper import SurfelMapper
 from scanweld.mapping.rendering import render_picture
 from scanweld.parallel import kernels_are_cached
 from scanweld.registration.robust_pairs import align_pairs_robustly
+from scanweld.registration.verification import noise_directions
 from scanweld.tracking.dynamics import MotionDetector
 from scanweld.tracking.tracker import FrameToModelTracker
 
@@ -91,11 +92,13 @@ def _compile_frames(report: Callable[[str], None], wait: Callable[[], object]) -
         mapper.fuse(pyramid, pose)
     mapper.map.clean(mapper.map.pages.live, 0, 1, 0.0)
     report("alignment (3 of 5)")
-    FrameToModelTracker().track(pyramid, mapper.view(pose, camera), pose)
+    view = mapper.view(pose, camera)
+    FrameToModelTracker().track(pyramid, view, pose)
+    noise_directions(view.positions_m, view.normals, pose, pyramid.levels[0], np.zeros(3), 1.0)  # on plain walls only
     detector = MotionDetector()
     detector.remember(pyramid, pose)
     nearer = build_pyramid(Frame(1.0, 0.5 * depth, frame.color, camera))
-    detector.find(nearer, mapper.view(pose, camera), pose)
+    detector.find(nearer, view, pose)
     report("pictures (4 of 5)")
     render_picture(mapper.map, pose, camera)
     behind, correction = se3.exp([0, 0, -0.1, 0, 0, 0]), se3.exp([0, 0, 0.09, 0, 0, 0])

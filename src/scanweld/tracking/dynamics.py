@@ -177,15 +177,15 @@ def _supported(level: SurfaceLevel, view: ModelView, T_world_camera: Float64) ->
     transform, intrinsics = se3.inverse(T_world_camera)[:3].astype(np.float32), intrinsics_array(level.camera)
     parameters = np.array([SUPPORT_SIGMAS, SUPPORT_FLOOR_M], np.float32)
     stable = np.float32(view.stable_confidence)
-    positions_m, confidences = view.positions_m[:, ::stride].copy(), view.confidences[::stride].copy()
+    positions_m, confidences = (as_kernel_input(side, np.float32) for side in (view.positions_m, view.confidences))
 
     def body(start: int, stop: int) -> None:
         kernels.mark_supported(
-            start, stop, positions_m, confidences, stable, transform, intrinsics,
+            start, stop, stride, positions_m, confidences, stable, transform, intrinsics,
             level.surface, parameters, supported,
         )  # fmt: skip
 
-    run_ranges(len(confidences), body)
+    run_ranges(len(confidences) // stride, body)
     return supported
 
 

@@ -30,17 +30,25 @@ def list_rows(index_map, confidences, least, stride, rows):
 
 
 @kernel
+def take_columns(values, columns, taken):
+    """Copy `columns` (M,) of values (C, N) to taken (C, M); `np.take` needs five times as long."""
+    for c in range(values.shape[0]):
+        for k in range(columns.shape[0]):
+            taken[c, k] = values[c, np.uint64(columns[k])]
+
+
+@kernel
 def mark_supported(
-    start, stop, positions, confidences, stable, transform, intrinsics, surface, parameters, supported
+    start, stop, stride, positions, confidences, stable, transform, intrinsics, surface, parameters, supported
 ):  # fmt: skip
-    """Mark the pixels whose surface a stable surfel confirms; looks at surfels start..stop.
+    """Mark the pixels whose surface a stable surfel confirms; looks at every `stride`-th surfel, start..stop of these.
 
     transform (3, 4) world -> camera; parameters (2,): gate in standard deviations, gate floor [m]; supported (H, W)
     uint8 becomes 1. Threads write nothing but ones.
     """
     height, width = supported.shape
     half = np.float32(0.5)
-    for i in range(start, stop):
+    for i in range(start * stride, stop * stride, stride):
         if confidences[i] < stable:
             continue
         x, y, z = positions[0, i], positions[1, i], positions[2, i]

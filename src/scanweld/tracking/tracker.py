@@ -10,7 +10,7 @@ from scanweld.arrays import Float32, Float64, Int64
 from scanweld.config import check_ranges, section, setting
 from scanweld.errors import ConfigError
 from scanweld.geometry import se3
-from scanweld.geometry.depth import SurfacePyramid
+from scanweld.geometry.depth import SurfacePyramid, as_kernel_input
 from scanweld.geometry.views import ModelView
 from scanweld.registration.photometric.refinement import Photometry
 from scanweld.registration.projective import ProjectiveConfig, align_projective, schedules
@@ -80,7 +80,7 @@ class FrameToModelTracker:
         predicted one.
         """
         rows = self._select(view)
-        positions_m, normals = (np.take(side, rows, axis=1, mode="clip") for side in (view.positions_m, view.normals))
+        positions_m, normals = _taken(view.positions_m, rows), _taken(view.normals, rows)
         scene = _Scene(positions_m, normals, pyramid, self._photometry(pyramid, view, rows))
         T_camera_world = se3.inverse(T_world_camera)
         first, *wider = schedules(self.config.projective)
@@ -163,7 +163,7 @@ class FrameToModelTracker:
         """Return the brightness of both sides where there is any and it is wanted."""
         if not self.config.uses_photometry or pyramid.grey is None or view.intensities is None:
             return None
-        return Photometry(view.intensities[rows], pyramid.grey, view, rows)
+        return Photometry(_taken(view.intensities[None], rows)[0], pyramid.grey, view, rows)
 
 
 def _listed(view: ModelView, least: float, stride: int = 1) -> Int64:
@@ -172,6 +172,13 @@ def _listed(view: ModelView, least: float, stride: int = 1) -> Int64:
         return np.empty(0, np.int64)
     rows = np.empty(view.index_map.size + 1, np.int64)
     return rows[: kernels.list_rows(view.index_map, view.confidences, np.float32(least), max(1, stride), rows)]
+
+
+def _taken(values: Float32, rows: Int64) -> Float32:
+    """Return columns `rows` (M,) of values (C, N)."""
+    taken = np.empty((len(values), len(rows)), np.float32)
+    kernels.take_columns(as_kernel_input(values, np.float32), rows, taken)
+    return taken
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,8 +10,8 @@ from scanweld.registration.kernels import BLOCK, ROW, accumulate, gather_surface
 COLUMNS = 9
 """Six of the motion, gain, offset, residual."""
 
-SUMS = 48
-"""Partial sums: 45 products of the columns, then loss, matched, projected."""
+SUMS = 46
+"""Partial sums: 45 products of the columns, then how many points count."""
 
 
 @kernel
@@ -53,7 +53,7 @@ def photometric_rows(count, moved, surface, lit, intrinsics, limits, model, rows
     fx, fy = intrinsics[0], intrinsics[1]
     squared_gate, min_cosine = limits[0] * limits[0], limits[1]
     gain, offset, s, freedom = model[0], model[1], model[2], model[3]
-    loss, matched = zero, zero
+    matched = zero
     for k in range(np.uint64(count)):
         x, y, z = moved[k], moved[k + ROW], moved[k + np.uint64(2) * ROW]
         a, b, c = moved[k + np.uint64(3) * ROW], moved[k + np.uint64(4) * ROW], moved[k + np.uint64(5) * ROW]
@@ -83,10 +83,38 @@ def photometric_rows(count, moved, surface, lit, intrinsics, limits, model, rows
         rows[k + np.uint64(6) * ROW], rows[k + np.uint64(7) * ROW] = m * s, s
         rows[k + np.uint64(8) * ROW] = r
         rows[k + np.uint64(9) * ROW] = counted * (freedom + one) / (freedom + r * r)
-        loss += counted * np.log(one + r * r / freedom)
         matched += counted
-    sums[45] += np.float32(0.5) * (freedom + one) * loss
-    sums[46] += matched
+    sums[45] += matched
+
+
+@kernel
+def sample_brightness(positions, normals, intensities, transform, surface, grey, intrinsics, limits, samples):
+    """Look up the brightness of points in the frame; returns how many it sees.
+
+    samples (2, N): their brightness and the frame's, of those that it sees; the rest as for `photometric_sums`.
+    """
+    moved, pixels = np.empty(6 * BLOCK, np.float32), np.empty(BLOCK, np.int32)
+    behind, lit = np.empty(7 * BLOCK, np.float32), np.empty(7 * BLOCK, np.float32)
+    height, width = grey.shape
+    seen = 0
+    for first in range(0, positions.shape[1], BLOCK):
+        count = min(BLOCK, positions.shape[1] - first)
+        project_block(first, count, positions, normals, transform, intrinsics, width, height, moved, pixels)
+        gather_surface(count, pixels, surface, behind)
+        gather_grey(first, count, moved, intensities, grey, intrinsics, lit)
+        for k in range(count):
+            dx, dy = moved[k] - behind[k], moved[k + BLOCK] - behind[k + BLOCK]
+            dz = moved[k + 2 * BLOCK] - behind[k + 2 * BLOCK]
+            nx, ny, nz = behind[k + 3 * BLOCK], behind[k + 4 * BLOCK], behind[k + 5 * BLOCK]
+            cosine = nx * moved[k + 3 * BLOCK] + ny * moved[k + 4 * BLOCK] + nz * moved[k + 5 * BLOCK]
+            e, f = lit[k + 5 * BLOCK], lit[k + 6 * BLOCK]
+            accept = (e >= 0) & (behind[k + 6 * BLOCK] > 0) & (cosine > limits[1])
+            accept &= dx * dx + dy * dy + dz * dz < limits[0] * limits[0]
+            top = lit[k + BLOCK] + e * (lit[k + 2 * BLOCK] - lit[k + BLOCK])
+            low = lit[k + 3 * BLOCK] + e * (lit[k + 4 * BLOCK] - lit[k + 3 * BLOCK])
+            samples[0, seen], samples[1, seen] = lit[k], top + f * (low - top)
+            seen += accept
+    return seen
 
 
 @kernel
@@ -107,9 +135,7 @@ def photometric_sums(
         sums[:] = 0.0
         for first in range(bounds[part], bounds[part + 1], BLOCK):
             count = min(BLOCK, bounds[part + 1] - first)
-            sums[47] += project_block(
-                first, count, positions, normals, transform, intrinsics, width, height, moved, pixels
-            )
+            project_block(first, count, positions, normals, transform, intrinsics, width, height, moved, pixels)
             gather_surface(count, pixels, surface, behind)
             gather_grey(first, count, moved, intensities, grey, intrinsics, lit)
             photometric_rows(count, moved, behind, lit, intrinsics, limits, model, rows, sums)

@@ -75,12 +75,11 @@ class LitTarget:
 class PhotometricSums:
     """Normal equations of K parts of the points, brightness eliminated or not (columns: motion, gain, offset).
 
-    information (K, 8, 8), gradient (K, 8), loss (K,), matched (K,).
+    information (K, 8, 8), gradient (K, 8), matched (K,).
     """
 
     information: Float64
     gradient: Float64
-    loss: Float64
     matched: Int64
 
 
@@ -123,7 +122,7 @@ def photometric_sums(
     rows, columns = _UPPER
     full[:, rows, columns] = partials[:, :45]
     full[:, columns, rows] = partials[:, :45]
-    return PhotometricSums(full[:, :8, :8], full[:, :8, 8], partials[:, 45], partials[:, 46].astype(np.int64))
+    return PhotometricSums(full[:, :8, :8], full[:, :8, 8], partials[:, 45].astype(np.int64))
 
 
 @dataclass(frozen=True, slots=True)
@@ -210,8 +209,7 @@ def estimate_brightness(
     Robust regression with Student's t and the median absolute deviation as the scale; None where too little is seen.
     """
     few = points.every(max(1, len(points) // SCALE_SAMPLES))
-    at = sightings(few, target, T_target_source, gate_m, min_cosine)
-    model, frame = at.model, at.frame
+    model, frame = brightness_samples(few, target, T_target_source, gate_m, min_cosine)
     if len(model) < MIN_SAMPLES:
         return None
     gain, offset = 1.0, _median(frame - model)
@@ -226,6 +224,19 @@ def estimate_brightness(
         gain = float((weights @ ((model - mean_model) * (frame - mean_frame)) + 1 / GAIN_STD**2) / spread)
         offset = float(mean_frame - gain * mean_model)
     return Brightness(gain, offset, scale)
+
+
+def brightness_samples(
+    points: LitPoints, target: LitTarget, T_target_source: Float64, gate_m: float, min_cosine: float
+) -> Float64:
+    """Return the brightness of the points that the frame sees, and the frame's there (2, M), as `sightings` does."""
+    samples = np.empty((2, len(points) + 1), np.float32)
+    seen = kernels.sample_brightness(
+        points.positions_m, points.normals, points.intensities, T_target_source[:3].astype(np.float32),
+        target.surface.surface.reshape(-1, 8), target.grey, intrinsics_array(target.surface.camera),
+        np.array([gate_m, min_cosine], np.float32), samples,
+    )  # fmt: skip
+    return samples[:, :seen].astype(np.float64)
 
 
 def _median(values: Float64) -> float:
