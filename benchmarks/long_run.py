@@ -17,16 +17,12 @@ import json
 import statistics
 import tempfile
 import time
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 import scanweld as sw
 from big_map import peak_mb, resident_mb
-from scanweld.arrays import Float64
-from scanweld.datasets.base import WrappedSequence
+from laps import Laps
 from scanweld.datasets.stream import stream
 from scanweld.mapping.storage.pages import MapConfig
 from scanweld.slam.warmup import compile_kernels
@@ -50,43 +46,6 @@ def main() -> None:
     storage = MapConfig(memory_budget_mb=arguments.budget_mb, folder=str(lap.parent))
     figures = run(Laps(sw.open_sequence(lap), arguments.frames), storage)
     print(json.dumps(figures, indent=1) if arguments.json else text(figures))
-
-
-@dataclass(frozen=True, slots=True)
-class Laps(WrappedSequence):
-    """The part of a sequence until it is back where it began, again and again, for `count` frames."""
-
-    count: int
-
-    @property
-    def round(self) -> int:
-        """Frames of one lap; what a rendered round overlaps itself by is left out, or the camera would leap."""
-        assert self.base.ground_truth is not None
-        places = self.base.ground_truth.T_world_camera[:, :3, 3]
-        half = len(places) // 2
-        return half + int(np.linalg.norm(places[half:] - places[0], axis=1).argmin())
-
-    @property
-    def timestamps_s(self) -> Float64:
-        """Time of every frame: each lap begins one frame after the one before."""
-        times = self.base.timestamps_s[: self.round]
-        period = times[-1] - times[0] + np.median(np.diff(times))
-        laps, frames = np.divmod(np.arange(self.count), len(times))
-        return np.asarray(times[frames] + laps * period)
-
-    @property
-    def ground_truth(self) -> sw.Trajectory:
-        """The same poses in every lap."""
-        truth = self.base.ground_truth
-        assert truth is not None
-        return sw.Trajectory(self.timestamps_s, truth.T_world_camera[np.arange(self.count) % self.round])
-
-    def __len__(self) -> int:
-        return self.count
-
-    def read(self, index: int) -> sw.Frame:
-        """Decode a frame; its time is that of its lap."""
-        return replace(self.base.read(index % self.round), timestamp_s=float(self.timestamps_s[index]))
 
 
 def run(sequence: Laps, storage: MapConfig) -> dict[str, Any]:
