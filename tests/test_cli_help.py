@@ -17,11 +17,12 @@ from scanweld.cli.usage import in_plain_words
 
 OPTIONS = {
     "demo": "--out --frames --threads --json",
+    "check": "--format --topics --camera --depth-scale --frames --json",
     "slam": "--out --format --camera --depth-scale --frames --scale --poses --config --set --threads --force --json "
     "--tracked-only --topics --refine --calibrate",
     "register": "--method --scale --init --global --voxel --max-distance --set --threads --explain --plot --out --json",
     "evaluate": "--align --json --plot",
-    "render": "--out --scene --path --path-frame --noise --frames --size --fps --seed --force",
+    "render": "--out --scene --path --path-frame --noise --frames --size --fps --spoil --seed --force",
     "repeat": "--out --threads --force --json",
     "report": "--truth --out",
     "view": "--host --port",

@@ -17,6 +17,7 @@ TITLES = {
     "viewer": "Viewer",
     "meshing": "Meshes",
     "datasets": "Sequences",
+    "checkup": "Checking sequences",
     "trajectory": "Trajectories",
     "evaluation": "Evaluation",
     "geometry": "Geometry",

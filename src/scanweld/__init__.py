@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from scanweld.backends import set_backend
+    from scanweld.checkup.examine import examine
+    from scanweld.checkup.findings import Checkup, Finding
     from scanweld.config import from_mapping, to_toml
     from scanweld.datasets.base import RgbdSequence
     from scanweld.datasets.gyroscope import Gyroscope
@@ -89,6 +91,8 @@ if TYPE_CHECKING:
 
 _HOME = {
     "backends": ("set_backend",),
+    "checkup.examine": ("examine",),
+    "checkup.findings": ("Checkup", "Finding"),
     "config": ("from_mapping", "to_toml"),
     "datasets.base": ("RgbdSequence",),
     "datasets.open": ("open_sequence",),
@@ -156,12 +160,14 @@ _HOME = {
 _MODULE_OF = {name: module for module, names in _HOME.items() for name in names}
 
 __all__ = [
+    "Checkup",
     "ClosedFormBatch",
     "ConfigError",
     "DatasetError",
     "DepthCorrection",
     "DynamicsConfig",
     "FileFormatError",
+    "Finding",
     "Frame",
     "FrameResult",
     "FrameState",
@@ -227,6 +233,7 @@ __all__ = [
     "doubled_surfaces",
     "edge_information",
     "estimate_normals",
+    "examine",
     "explain_horn",
     "explain_icp",
     "from_mapping",

@@ -44,7 +44,16 @@ class FileFormatError(ScanweldError):
 
 
 class DatasetError(ScanweldError):
-    """A sequence cannot be used: missing, empty, inconsistent or of an unknown format."""
+    """A sequence cannot be used: missing, empty, inconsistent or of an unknown format.
+
+    Attributes
+    ----------
+    fault : what `scanweld check` calls that, where it has a name for it
+    """
+
+    def __init__(self, message: str = "", *, fault: str = "") -> None:
+        super().__init__(message)
+        self.fault = fault
 
 
 class UnreadableFrameError(DatasetError):

@@ -16,6 +16,7 @@ from typing import Annotated, Any
 import typer
 
 from scanweld.cli.bench import bench
+from scanweld.cli.check import check
 from scanweld.cli.completion import completion
 from scanweld.cli.config import config
 from scanweld.cli.datasets import datasets
@@ -62,6 +63,7 @@ def _stoppable(command: Callable[..., int]) -> Callable[..., int]:
 
 for command in (
     demo,
+    check,
     slam,
     register,
     evaluate,

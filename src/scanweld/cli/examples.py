@@ -7,6 +7,10 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
         ("scanweld demo", "see the whole job on a rendered room"),
         ("scanweld demo --frames 30 --out my-demo", "shorter, and kept elsewhere"),
     ),
+    "check": (
+        ("scanweld check desk", "is it fit to be mapped?"),
+        ("scanweld check desk --depth-scale 1000 --json", "for a script"),
+    ),
     "slam": (
         ("scanweld slam desk --out run", "map a recording"),
         ("scanweld slam desk.r3d --frames 100:400 --scale 0.5", "a part, half the size"),

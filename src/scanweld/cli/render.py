@@ -37,6 +37,10 @@ def render(
     ] = None,
     size: Annotated[str | None, Option(help="Image size. Default: 640x480.", metavar="WxH")] = None,
     fps: Annotated[float | None, Option(help="Frames per second. Default: 30.")] = None,
+    spoil: Annotated[
+        str | None,
+        Option(help="Make a mistake on purpose, to see what scanweld check says of it.", metavar="FAULT"),
+    ] = None,
     seed: Annotated[int | None, Option(help="Seed of noise and small things in the scene. Default: 0.")] = None,
     force: Annotated[bool, Option("--force", help="Replace a sequence that exists.")] = False,
 ) -> int:
@@ -53,10 +57,10 @@ def render(
         given["width"], given["height"] = parse_size(size)
     config = RenderConfig(**{key: value for key, value in given.items() if value is not None})
     with CountProgress("rendering frames") as progress:
-        sequence = render_sequence(out, config, force=force, progress=progress.update)
+        sequence = render_sequence(out, config, spoil=spoil or "", force=force, progress=progress.update)
     camera, truth = sequence.camera, sequence.ground_truth
+    length_m = 0.0 if truth is None else truth.path_length_m
     typer.echo(
-        f"{out}: {len(sequence)} frames of {sequence.name}, {camera.width}x{camera.height}, "
-        f"{truth.path_length_m:.2f} m of path"
+        f"{out}: {len(sequence)} frames of {sequence.name}, {camera.width}x{camera.height}, {length_m:.2f} m of path"
     )
     return 0

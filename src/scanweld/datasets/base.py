@@ -157,7 +157,8 @@ class FileSequence:
             if not after.timestamp_s > before.timestamp_s:
                 raise DatasetError(
                     f"{self.name}: time must increase from frame to frame; {after.depth.name} has "
-                    f"{after.timestamp_s:.6f} s after {before.timestamp_s:.6f} s"
+                    f"{after.timestamp_s:.6f} s after {before.timestamp_s:.6f} s",
+                    fault="time-order",
                 )
 
     @property

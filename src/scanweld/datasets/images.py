@@ -281,6 +281,12 @@ def check_depth_unit(median_depth_m: float, depth_scale: float) -> str | None:
     return f"{seen}; the unit is likely {_unit(scale)} ({raw / scale:.3g} m): pass --depth-scale {scale:g}"
 
 
+def likely_depth_scale(measured: float) -> float:
+    """Return the unit in use, in units per metre, that is within a third of a measured one; else that one."""
+    nearest = min(_KNOWN_DEPTH_SCALES, key=lambda scale: abs(math.log(scale / measured)))
+    return nearest if abs(math.log(nearest / measured)) < math.log(4 / 3) else measured
+
+
 def explain_unusable_depth(median_depth_m: float, depth_scale: float, range_m: tuple[float, float]) -> str:
     """Say in one line why depth gave no surface, and which unit it likely has.
 

@@ -85,7 +85,13 @@ def make_camera(intrinsics: Intrinsics, width: int, height: int, where: str) -> 
     """
     fx, fy, cx, cy = intrinsics
     if fy < 0:
-        logger.info("%s: fy = %g is taken as %g (the camera's y axis points down)", where, fy, -fy)
+        logger.warning(
+            "%s: fy = %g is taken as %g (the camera's y axis points down)",
+            where,
+            fy,
+            -fy,
+            extra={"fault": "negative-fy"},
+        )
         fy = -fy
     if all(map(math.isfinite, intrinsics)) and not (
         min(fx, fy) <= 0 or (_ABSURD_FOCAL[0] < min(fx, fy) and max(fx, fy, abs(cx), abs(cy)) < _ABSURD_FOCAL[1])

@@ -208,7 +208,7 @@ def settle_camera(
         raise DatasetError(f"{where}: the intrinsics are not known; pass --camera FX,FY,CX,CY")
     doubt = doubt_camera(camera)
     if doubt is not None:
-        logger.warning("%s: %s", named, doubt)
+        logger.warning("%s: %s", named, doubt, extra={"fault": "intrinsics"})
     return camera
 
 
@@ -222,7 +222,7 @@ def settle_depth_scale(where: Path, default: float, given: CameraFile | None, ov
     passed = require_depth_scale(overrides.depth_scale)
     contradiction = compare_depth_units(stated, passed, source)
     if contradiction is not None:
-        logger.warning(contradiction)
+        logger.warning(contradiction, extra={"fault": "depth-unit"})
     return passed
 
 
@@ -239,7 +239,8 @@ def _image_size(name: str, frames: Sequence[FrameFiles], *, depth_is_image: bool
         if depth is None:
             raise DatasetError(f"{files.depth}: without a colour image its size is not known")
         if depth_is_image and depth_header_fault(depth):
-            raise DatasetError(f"{files.depth}: {depth_header_fault(depth)}")
+            swapped = color is not None and not depth_header_fault(color)
+            raise DatasetError(f"{files.depth}: {depth_header_fault(depth)}", fault="swapped" if swapped else "")
         if color is not None and _size(color) != _size(depth):
             raise DatasetError(
                 f"{files.color} is {color.width}x{color.height}, {files.depth.name} is "

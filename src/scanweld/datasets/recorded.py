@@ -53,7 +53,7 @@ class RecordedSequence:
         if times.ndim != 1 or len(times) == 0:
             raise DatasetError(f"{self.name}: the sequence has no frame")
         if not _increase(times):
-            raise DatasetError(f"{self.name}: time must be finite and increase from frame to frame")
+            raise DatasetError(f"{self.name}: time must be finite and increase from frame to frame", fault="time-order")
         times.flags.writeable = False
         object.__setattr__(self, "timestamps_s", times)
 

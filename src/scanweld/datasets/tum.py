@@ -111,7 +111,8 @@ def _paired(folder: Path, depth: list[tuple[float, Path]], color: list[tuple[flo
         raise DatasetError(
             f"{folder}: no depth image within {MAX_TIME_DIFFERENCE_S} s of a colour image; depth.txt spans "
             f"{depth_times_s[0]:.3f} to {depth_times_s[-1]:.3f} s, rgb.txt {color_times_s[0]:.3f} to "
-            f"{color_times_s[-1]:.3f} s; are both in seconds of one clock?"
+            f"{color_times_s[-1]:.3f} s; are both in seconds of one clock?",
+            fault="time-unit",
         )
     dropped = len(depth) + len(color) - 2 * len(pairs)
     if dropped:
@@ -173,5 +174,6 @@ def _time(path: Path, number: int, word: str, before_s: float | None) -> float:
         raise DatasetError(f"{path}, line {number}: expected a timestamp [s], got {word[:40]!r}")
     if before_s is not None and time <= before_s:
         what, fix = ("repeats", "remove one of the two") if time == before_s else ("is before", "sort the file")
-        raise DatasetError(f"{path}, line {number}: timestamp {time:.6f} {what} {before_s:.6f} above it; {fix}")
+        message = f"{path}, line {number}: timestamp {time:.6f} {what} {before_s:.6f} above it; {fix}"
+        raise DatasetError(message, fault="time-order")
     return time

@@ -14,6 +14,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from scanweld.arrays import Float64
+from scanweld.checkup.first_look import FirstLook
 from scanweld.datasets.base import LiveSequence, RgbdSequence
 from scanweld.datasets.gyroscope import gyroscope_of
 from scanweld.datasets.images import check_depth_unit, explain_unusable_depth
@@ -308,7 +309,9 @@ def run_sequence(
                 if realtime:
                     load_kernels()
                 played_by = (clock or WallClock()) if realtime else None
-                _process_all(run.slam, sequence, run.tally, given, after_frame, played_by)
+                # Which takes longer than the time between two frames.
+                look = FirstLook(sequence) if timeless else None
+                _process_all(run.slam, sequence, run.tally, given, after_frame, played_by, look)
                 run.slam.finish()
                 if calibrate or refine:
                     keep(run.slam, -1, None, surely=True)
@@ -358,6 +361,7 @@ def _process_all(
     given: list[Float64 | None] | None,
     after_frame: AfterFrame,
     clock: Clock | None = None,
+    look: FirstLook | None = None,
 ) -> None:
     """Walk through a sequence: track each frame, or take its given T_world_camera; with a clock, at its pace."""
     gyroscope = gyroscope_of(sequence)
@@ -387,6 +391,8 @@ def _process_all(
                 result = slam.skip(record.timestamp_s, "no given pose")
             else:
                 tally.count(record.index, record.frame, sequence.depth_scale)
+                for finding in look.see(record.index, record.frame) if look else ():
+                    tally.warn(str(finding))
                 result = slam.process(
                     record.frame,
                     pyramid=record.prepared,

@@ -10,7 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from scanweld.arrays import Array
-from scanweld.datasets.synthetic.sequence import DEPTH_SCALE, RenderConfig, SyntheticSequence
+from scanweld.datasets.base import RgbdSequence
+from scanweld.datasets.synthetic.sequence import RenderConfig, SyntheticSequence
+from scanweld.datasets.synthetic.spoiling import Spoil, find_spoil
 from scanweld.errors import OutputError
 from scanweld.geometry.camera import PinholeCamera
 from scanweld.io.atomic import write_folder
@@ -23,9 +25,10 @@ def render_sequence(
     folder: str | os.PathLike[str],
     config: RenderConfig | None = None,
     *,
+    spoil: str = "",
     force: bool = False,
     progress: Callable[[int, int], None] | None = None,
-) -> SyntheticSequence:
+) -> RgbdSequence:
     """Render a sequence into a folder: TUM RGB-D layout, exact ground truth, `camera.json`.
 
     The folder holds `rgb/*.png`, `depth/*.png` (16 bits, 5000 = 1 m, 0 invalid), `rgb.txt`, `depth.txt`,
@@ -36,23 +39,32 @@ def render_sequence(
     ----------
     folder : where to
     config : what to render
+    spoil : a fault of :data:`~.spoiling.SPOILS` to be made on purpose
     force : replace a folder that holds something
     progress : called with (frames done, frames in all) after every frame
 
     Raises
     ------
+    ConfigError
+        When there is no such fault.
     OutputError
         When the folder holds something and `force` is not given, or it cannot be written.
     """
-    sequence = SyntheticSequence(config)
+    sequence: RgbdSequence = SyntheticSequence(config)
+    fault = find_spoil(spoil) if spoil else Spoil("none")
+    if fault.sequence is not None:
+        sequence = fault.sequence(sequence)
     with write_folder(Path(folder), force=force, kind="rendered sequence", mark="associations.txt") as aside:
         _write_frames(aside, sequence, progress)
-        write_tum(aside / "groundtruth.txt", sequence.ground_truth)
-        _write_camera(aside / "camera.json", sequence.camera)
+        if sequence.ground_truth is not None:  # it never is
+            write_tum(aside / "groundtruth.txt", sequence.ground_truth)
+        _write_camera(aside / "camera.json", sequence.camera, sequence.depth_scale)
+        if fault.folder is not None:
+            fault.folder(aside)
     return sequence
 
 
-def _write_frames(folder: Path, sequence: SyntheticSequence, progress: Callable[[int, int], None] | None) -> None:
+def _write_frames(folder: Path, sequence: RgbdSequence, progress: Callable[[int, int], None] | None) -> None:
     """Write the images and the lists that name them."""
     stamps = [f"{time:.6f}" for time in sequence.timestamps_s]
     lists = {
@@ -65,8 +77,10 @@ def _write_frames(folder: Path, sequence: SyntheticSequence, progress: Callable[
     (folder / "rgb").mkdir()
     (folder / "depth").mkdir()
     for index, stamp in enumerate(stamps):
-        color, depth = sequence.read_stored(index)
-        _write_png(folder / "rgb" / f"{stamp}.png", np.ascontiguousarray(color[..., ::-1]))  # OpenCV wants BGR
+        frame = sequence.read(index)
+        assert frame.color is not None
+        depth = np.rint(frame.depth_m.astype(np.float64) * sequence.depth_scale).astype(np.uint16)
+        _write_png(folder / "rgb" / f"{stamp}.png", np.ascontiguousarray(frame.color[..., ::-1]))  # OpenCV wants BGR
         _write_png(folder / "depth" / f"{stamp}.png", depth)
         if progress is not None:
             progress(index + 1, len(stamps))
@@ -81,9 +95,9 @@ def _write_png(path: Path, image: Array) -> None:
     path.write_bytes(data.tobytes())
 
 
-def _write_camera(path: Path, camera: PinholeCamera) -> None:
+def _write_camera(path: Path, camera: PinholeCamera, depth_scale: float) -> None:
     values = {
         "fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy,
-        "width": camera.width, "height": camera.height, "depth_scale": DEPTH_SCALE,
+        "width": camera.width, "height": camera.height, "depth_scale": depth_scale,
     }  # fmt: skip
     path.write_text(json.dumps(values, indent=2) + "\n", encoding="ascii")

@@ -1,0 +1,84 @@
+"""`scanweld check`: what is wrong with a recording, before it is used."""
+
+from __future__ import annotations
+
+import json
+import textwrap
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from scanweld.cli.completion import formats
+
+if TYPE_CHECKING:
+    from scanweld.checkup.findings import Checkup
+
+Option = typer.Option
+
+COLUMNS = 100
+
+
+def check(
+    sequence: Annotated[Path, typer.Argument(help="Sequence: a folder or a recording, as for slam.")],
+    format_name: Annotated[
+        str, Option("--format", help="Format of the sequence, as for slam.", autocompletion=formats)
+    ] = "auto",
+    topics: Annotated[
+        str | None, Option(help="Topics of a bag, where it has several.", metavar="depth=/A,color=/B")
+    ] = None,
+    camera: Annotated[str | None, Option(help="Intrinsics of the images on disk.", metavar="FX,FY,CX,CY")] = None,
+    depth_scale: Annotated[float | None, Option(help="Depth units per metre, for example 5000.")] = None,
+    frames: Annotated[str | None, Option(help="Look at a part of the frames.", metavar="A:B[:STEP]")] = None,
+    json_output: Annotated[bool, Option("--json", help="Print findings and figures as one JSON object.")] = False,
+) -> int:
+    """Look for what is wrong with a recording before it is used, and say what to do about it.
+
+    Depth unit, intrinsics, colour against depth, times, gaps, repeated frames, depth, blur, exposure, pace and ground
+    truth are judged by about a hundred frames, in seconds. Exit code 3 says that something was found.
+    """
+    started = time.perf_counter()
+    from scanweld.checkup.examine import examine_input
+    from scanweld.datasets.intrinsics import parse_intrinsics
+    from scanweld.datasets.open import open_sequence
+
+    checkup = examine_input(
+        sequence,
+        lambda: open_sequence(
+            sequence,
+            format=format_name,
+            camera=parse_intrinsics(camera) if camera else None,
+            depth_scale=depth_scale,
+            frames=frames,
+            topics=topics,
+        ),
+    )
+    seconds = time.perf_counter() - started
+    if json_output:
+        typer.echo(json.dumps({**checkup.as_dict(), "seconds": seconds}))
+    else:
+        typer.echo("\n".join(_lines(checkup, seconds)))
+    return 0 if checkup.sound else 3
+
+
+def _lines(checkup: Checkup, seconds: float) -> Iterator[str]:
+    """The findings, those that weigh most first, and what was measured, for a person."""
+    looked = f"looked at {checkup.num_looked_at} of {checkup.num_frames} frames in {seconds:.1f} s"
+    if checkup.sound:
+        verdict = "nothing wrong was found"
+    else:
+        count = len(checkup.findings)
+        verdict = f"{count} thing{'s' * (count > 1)} to put right"
+    yield f"{checkup.name}: {verdict}" + (f" ({looked})" if checkup.num_frames else "")
+    for finding in checkup.findings:
+        yield ""
+        yield f"{finding.level.value}: {finding.fault}"
+        for name, text in (("seen", finding.seen), ("why", finding.why), ("do", finding.advice)):
+            yield textwrap.fill(text, COLUMNS, initial_indent=f"  {name:<5} ", subsequent_indent=" " * 8)
+    if checkup.figures:
+        yield ""
+        width = max(map(len, checkup.figures))
+        for name, value in checkup.figures.items():
+            yield f"  {name:<{width}}  {'not to be told' if value is None else f'{value:.4g}'}"
