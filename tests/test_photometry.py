@@ -19,12 +19,12 @@ from scanweld.registration.photometric.residuals import (
     Brightness,
     LitPoints,
     LitTarget,
-    brightness_samples,
     eliminate_brightness,
     estimate_brightness,
     half_grey,
     photometric_sums,
     reference_rows,
+    seen_points,
     sightings,
 )
 from scanweld.tracking.rotation import find_turns, thumbnails
@@ -56,6 +56,11 @@ NEAR = se3.exp([0.004, -0.003, 0.002, 0.003, -0.002, 0.004])
 LIGHT = Brightness(1.1, -7.0, 4.0)
 
 
+def seen_room() -> LitPoints:
+    """Those points of `lit_room` that its frame sees from `NEAR`."""
+    return seen_points(*lit_room(), NEAR, GATE_M, MIN_COSINE)[0]
+
+
 def map_of(sequence: object, stop: int) -> sw.SurfelMapper:
     mapper = sw.SurfelMapper()
     for k in range(stop):
@@ -77,7 +82,7 @@ class TestResiduals:
     @pytest.mark.parametrize("parts", [1, 3, 8])
     def test_kernel_sums_what_numpy_sums(self, parts: int) -> None:
         points, target = lit_room()
-        sums = photometric_sums(points, target, NEAR, LIGHT, GATE_M, MIN_COSINE, parts)
+        sums = photometric_sums(seen_room(), target, NEAR, LIGHT, parts)
         rows = reference_rows(points, target, NEAR, LIGHT, GATE_M, MIN_COSINE)
         A, r = rows.jacobian / LIGHT.scale, rows.residuals / LIGHT.scale
         weights = (FREEDOM + 1) / (FREEDOM + r**2)
@@ -111,14 +116,16 @@ class TestResiduals:
             checked += int(smooth.sum())
         assert checked > 2000
 
-    def test_kernel_samples_what_numpy_sees(self) -> None:
+    def test_kernel_lists_what_numpy_sees(self) -> None:
         """Of 1000 points from a pose that puts some of them outside: the same points, brightness within rounding."""
         points, target = lit_room()
         few, T = points.every(len(points) // 1000), se3.exp([0.01, 0, 0, 0, 0.2, 0])
         at = sightings(few, target, T, GATE_M, MIN_COSINE)
-        model, frame = brightness_samples(few, target, T, GATE_M, MIN_COSINE)
-        assert 50 < len(model) < len(few)
-        np.testing.assert_array_equal(model, at.model)
+        seen, frame = seen_points(few, target, T, GATE_M, MIN_COSINE)
+        assert 50 < len(seen) < len(few)
+        np.testing.assert_array_equal(seen.positions_m, few.positions_m[:, at.seen])
+        np.testing.assert_array_equal(seen.normals, few.normals[:, at.seen])
+        np.testing.assert_array_equal(seen.intensities, at.model)
         np.testing.assert_allclose(frame, at.frame, atol=2e-2)
 
     def test_brightness_is_found(self) -> None:
@@ -140,8 +147,8 @@ class TestResiduals:
 
     def test_elimination_solves_for_motion_and_brightness_together(self) -> None:
         """The Schur complement's step is that of the system of eight, with the prior on the gain."""
-        points, target = lit_room()
-        sums = photometric_sums(points, target, NEAR, LIGHT, GATE_M, MIN_COSINE, 4)
+        _, target = lit_room()
+        sums = photometric_sums(seen_room(), target, NEAR, LIGHT, 4)
         eliminated = eliminate_brightness(sums, LIGHT)
         H, g = sums.information.sum(axis=0), sums.gradient.sum(axis=0)
         H = H + np.diag([0] * 6 + [1 / 0.3**2, 1e-9])
@@ -167,11 +174,11 @@ class TestResiduals:
     def test_same_bytes_at_any_number_of_threads(self) -> None:
         from scanweld.parallel import limited_threads
 
-        points, target = lit_room()
+        _, target = lit_room()
         answers = set()
         for threads in (1, 2, 5):
             with limited_threads(threads):
-                sums = photometric_sums(points, target, NEAR, LIGHT, GATE_M, MIN_COSINE, 8)
+                sums = photometric_sums(seen_room(), target, NEAR, LIGHT, 8)
             answers.add(sums.information.tobytes() + sums.gradient.tobytes())
         assert len(answers) == 1
 

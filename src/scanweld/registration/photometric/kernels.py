@@ -39,59 +39,25 @@ def gather_grey(first, count, moved, intensities, grey, intrinsics, lit):
 
 
 @kernel
-def photometric_rows(count, moved, surface, lit, intrinsics, limits, model, rows, sums):
-    """Fill rows (10 * BLOCK,) with J (8), r, w of the points; those that the frame does not see weigh nothing.
-
-    r = gain I_model + offset - I(pi(p)), with I interpolated bilinearly and differentiated as interpolated;
-    J = [d, p x d, I_model, 1] with d = dr/dp = -dI/du du/dp. A point counts when the surface behind its pixel is within
-    the gate of it. Residuals are in units of their scale; weights are those of Student's t (Lange et al. 1989).
-
-    moved, surface, lit: see `project_block`, `gather_surface`, `gather_grey`; limits: gate [m], smallest cosine; model:
-    gain, offset, 1 / scale, degrees of freedom.
-    """
-    one, zero = np.float32(1), np.float32(0)
-    fx, fy = intrinsics[0], intrinsics[1]
-    squared_gate, min_cosine = limits[0] * limits[0], limits[1]
-    gain, offset, s, freedom = model[0], model[1], model[2], model[3]
-    matched = zero
-    for k in range(np.uint64(count)):
-        x, y, z = moved[k], moved[k + ROW], moved[k + np.uint64(2) * ROW]
-        a, b, c = moved[k + np.uint64(3) * ROW], moved[k + np.uint64(4) * ROW], moved[k + np.uint64(5) * ROW]
-        dx, dy, dz = x - surface[k], y - surface[k + ROW], z - surface[k + np.uint64(2) * ROW]
-        cosine = (
-            surface[k + np.uint64(3) * ROW] * a
-            + surface[k + np.uint64(4) * ROW] * b
-            + surface[k + np.uint64(5) * ROW] * c
-        )
-        m, i00, i01 = lit[k], lit[k + ROW], lit[k + np.uint64(2) * ROW]
-        i10, i11 = lit[k + np.uint64(3) * ROW], lit[k + np.uint64(4) * ROW]
-        e, f = lit[k + np.uint64(5) * ROW], lit[k + np.uint64(6) * ROW]
-        accept = (e >= zero) & (surface[k + np.uint64(6) * ROW] > zero)
-        accept = accept & (dx * dx + dy * dy + dz * dz < squared_gate) & (cosine > min_cosine)
-        top, low = i00 + e * (i01 - i00), i10 + e * (i11 - i10)
-        slope_u = (i01 - i00) * (one - f) + (i11 - i10) * f
-        slope_v = low - top
-        inverse = one / max(z, np.float32(1e-3))
-        r = (gain * m + offset - top - f * slope_v) * s
-        jx = -slope_u * fx * inverse * s
-        jy = -slope_v * fy * inverse * s
-        jz = -(jx * x + jy * y) * inverse
-        counted = one if accept else zero
-        rows[k], rows[k + ROW], rows[k + np.uint64(2) * ROW] = jx, jy, jz
-        rows[k + np.uint64(3) * ROW], rows[k + np.uint64(4) * ROW] = y * jz - z * jy, z * jx - x * jz
-        rows[k + np.uint64(5) * ROW] = x * jy - y * jx
-        rows[k + np.uint64(6) * ROW], rows[k + np.uint64(7) * ROW] = m * s, s
-        rows[k + np.uint64(8) * ROW] = r
-        rows[k + np.uint64(9) * ROW] = counted * (freedom + one) / (freedom + r * r)
-        matched += counted
-    sums[45] += matched
+def on_the_surface(k, moved, behind, limits):
+    """Whether point k is within limits[0] [m] of the surface behind its pixel, and the cosine is above limits[1]."""
+    dx, dy, dz = (
+        moved[k] - behind[k],
+        moved[k + BLOCK] - behind[k + BLOCK],
+        moved[k + 2 * BLOCK] - behind[k + 2 * BLOCK],
+    )
+    nx, ny, nz = behind[k + 3 * BLOCK], behind[k + 4 * BLOCK], behind[k + 5 * BLOCK]
+    cosine = nx * moved[k + 3 * BLOCK] + ny * moved[k + 4 * BLOCK] + nz * moved[k + 5 * BLOCK]
+    near = dx * dx + dy * dy + dz * dz < limits[0] * limits[0]
+    return (behind[k + 6 * BLOCK] > 0) & near & (cosine > limits[1])
 
 
 @kernel
-def sample_brightness(positions, normals, intensities, transform, surface, grey, intrinsics, limits, samples):
-    """Look up the brightness of points in the frame; returns how many it sees.
+def list_seen(positions, normals, intensities, transform, surface, grey, intrinsics, limits, values, frame):
+    """List the points that the frame sees; returns how many.
 
-    samples (2, N): their brightness and the frame's, of those that it sees; the rest as for `photometric_sums`.
+    values (7, N): position, normal and brightness of those that it sees; frame (N,): its own brightness there; surface
+    (H * W, 8) and grey (H, W) float32, the frame; the rest as for `photometric_sums` and `on_the_surface`.
     """
     moved, pixels = np.empty(6 * BLOCK, np.float32), np.empty(BLOCK, np.int32)
     behind, lit = np.empty(7 * BLOCK, np.float32), np.empty(7 * BLOCK, np.float32)
@@ -103,32 +69,67 @@ def sample_brightness(positions, normals, intensities, transform, surface, grey,
         gather_surface(count, pixels, surface, behind)
         gather_grey(first, count, moved, intensities, grey, intrinsics, lit)
         for k in range(count):
-            dx, dy = moved[k] - behind[k], moved[k + BLOCK] - behind[k + BLOCK]
-            dz = moved[k + 2 * BLOCK] - behind[k + 2 * BLOCK]
-            nx, ny, nz = behind[k + 3 * BLOCK], behind[k + 4 * BLOCK], behind[k + 5 * BLOCK]
-            cosine = nx * moved[k + 3 * BLOCK] + ny * moved[k + 4 * BLOCK] + nz * moved[k + 5 * BLOCK]
+            for axis in range(3):
+                values[axis, seen] = positions[axis, first + k]
+                values[axis + 3, seen] = normals[axis, first + k]
             e, f = lit[k + 5 * BLOCK], lit[k + 6 * BLOCK]
-            accept = (e >= 0) & (behind[k + 6 * BLOCK] > 0) & (cosine > limits[1])
-            accept &= dx * dx + dy * dy + dz * dz < limits[0] * limits[0]
             top = lit[k + BLOCK] + e * (lit[k + 2 * BLOCK] - lit[k + BLOCK])
             low = lit[k + 3 * BLOCK] + e * (lit[k + 4 * BLOCK] - lit[k + 3 * BLOCK])
-            samples[0, seen], samples[1, seen] = lit[k], top + f * (low - top)
-            seen += accept
+            values[6, seen], frame[seen] = lit[k], top + f * (low - top)
+            seen += (e >= 0) & on_the_surface(k, moved, behind, limits)  # written always, counted only when seen
     return seen
 
 
 @kernel
+def photometric_rows(count, moved, lit, intrinsics, model, rows, sums):
+    """Fill rows (10 * BLOCK,) with J (8), r, w of the points; those outside the image weigh nothing.
+
+    r = gain I_model + offset - I(pi(p)), with I interpolated bilinearly and differentiated as interpolated;
+    J = [d, p x d, I_model, 1] with d = dr/dp = -dI/du du/dp. Residuals are in units of their scale; weights are those
+    of Student's t (Lange et al. 1989).
+
+    moved, lit: see `project_block`, `gather_grey`; model: gain, offset, 1 / scale, degrees of freedom.
+    """
+    one, zero = np.float32(1), np.float32(0)
+    fx, fy = intrinsics[0], intrinsics[1]
+    gain, offset, s, freedom = model[0], model[1], model[2], model[3]
+    matched = zero
+    for k in range(np.uint64(count)):
+        x, y, z = moved[k], moved[k + ROW], moved[k + np.uint64(2) * ROW]
+        m, i00, i01 = lit[k], lit[k + ROW], lit[k + np.uint64(2) * ROW]
+        i10, i11 = lit[k + np.uint64(3) * ROW], lit[k + np.uint64(4) * ROW]
+        e, f = lit[k + np.uint64(5) * ROW], lit[k + np.uint64(6) * ROW]
+        top, low = i00 + e * (i01 - i00), i10 + e * (i11 - i10)
+        slope_u = (i01 - i00) * (one - f) + (i11 - i10) * f
+        slope_v = low - top
+        inverse = one / max(z, np.float32(1e-3))
+        r = (gain * m + offset - top - f * slope_v) * s
+        jx = -slope_u * fx * inverse * s
+        jy = -slope_v * fy * inverse * s
+        jz = -(jx * x + jy * y) * inverse
+        counted = one if e >= zero else zero
+        rows[k], rows[k + ROW], rows[k + np.uint64(2) * ROW] = jx, jy, jz
+        rows[k + np.uint64(3) * ROW], rows[k + np.uint64(4) * ROW] = y * jz - z * jy, z * jx - x * jz
+        rows[k + np.uint64(5) * ROW] = x * jy - y * jx
+        rows[k + np.uint64(6) * ROW], rows[k + np.uint64(7) * ROW] = m * s, s
+        rows[k + np.uint64(8) * ROW] = r
+        rows[k + np.uint64(9) * ROW] = counted * (freedom + one) / (freedom + r * r)
+        matched += counted
+    sums[45] += matched
+
+
+@kernel
 def photometric_sums(
-    start, stop, bounds, positions, normals, intensities, transform, surface, grey, intrinsics, limits, model, partials
+    start, stop, bounds, positions, normals, intensities, transform, grey, intrinsics, model, partials
 ):
     """Sums of parts start..stop into partials (parts, SUMS) float64; part k is points bounds[k]..bounds[k + 1].
 
     positions, normals (3, N), intensities (N,) float32 in the source frame; transform (3, 4) float32 source -> target;
-    surface (H * W, 8) and grey (H, W) float32, the target; the rest as for `photometric_rows`.
+    grey (H, W) float32, the target; model: see `photometric_rows`.
     """
     moved, pixels = np.empty(6 * BLOCK, np.float32), np.empty(BLOCK, np.int32)
-    behind, lit = np.empty(7 * BLOCK, np.float32), np.empty(7 * BLOCK, np.float32)
-    rows, weighted = np.empty((COLUMNS + 1) * BLOCK, np.float32), np.empty(BLOCK, np.float32)
+    lit, weighted = np.empty(7 * BLOCK, np.float32), np.empty(BLOCK, np.float32)
+    rows = np.empty((COLUMNS + 1) * BLOCK, np.float32)
     height, width = grey.shape
     for part in range(start, stop):
         sums = partials[part]
@@ -136,7 +137,6 @@ def photometric_sums(
         for first in range(bounds[part], bounds[part + 1], BLOCK):
             count = min(BLOCK, bounds[part + 1] - first)
             project_block(first, count, positions, normals, transform, intrinsics, width, height, moved, pixels)
-            gather_surface(count, pixels, surface, behind)
             gather_grey(first, count, moved, intensities, grey, intrinsics, lit)
-            photometric_rows(count, moved, behind, lit, intrinsics, limits, model, rows, sums)
+            photometric_rows(count, moved, lit, intrinsics, model, rows, sums)
             accumulate(rows, COLUMNS, count, weighted, sums)

@@ -26,6 +26,7 @@ from scanweld.registration.photometric.residuals import (
     estimate_brightness,
     half_grey,
     photometric_sums,
+    seen_points,
 )
 
 logger = logging.getLogger(__name__)
@@ -143,11 +144,11 @@ def refine_observed(
     brightness = estimate_brightness(points, target, T_target_source, gates.distance_m, gates.min_cosine)
     if brightness is None:
         return Refinement(T_target_source, "too few points with brightness")
+    points, _ = seen_points(points, target, T_target_source, gates.distance_m, gates.min_cosine)
 
     def light(x: Float64, parts: int = 1) -> Eliminated:
         T = se3.exp(x) @ T_target_source
-        sums = photometric_sums(points, target, T, brightness, gates.distance_m, gates.min_cosine, parts)
-        return eliminate_brightness(sums, brightness)
+        return eliminate_brightness(photometric_sums(points, target, T, brightness, parts), brightness)
 
     H_g, g_g = shares.information.sum(axis=0), shares.gradient.sum(axis=0)
     x_g = -solve_or_zero(H_g, g_g)

@@ -98,23 +98,22 @@ def photometric_sums(
     target: LitTarget,
     T_target_source: Float64,
     brightness: Brightness,
-    gate_m: float,
-    min_cosine: float,
     parts: int = 1,
 ) -> PhotometricSums:
-    """Sum the photometric normal equations of `parts` contiguous shares of the points."""
+    """Sum the photometric normal equations of `parts` contiguous shares of the points.
+
+    Which of them the frame sees was decided before (:func:`seen_points`): a small motion does not change that.
+    """
     bounds = np.linspace(0, len(points), parts + 1).astype(np.int64)
     partials = np.empty((parts, kernels.SUMS))
     transform = T_target_source[:3].astype(np.float32)
-    surface = target.surface.surface.reshape(-1, 8)
     intrinsics = intrinsics_array(target.surface.camera)
-    limits = np.array([gate_m, min_cosine], np.float32)
     model = brightness.model
 
     def body(start: int, stop: int) -> None:
         kernels.photometric_sums(
-            start, stop, bounds, points.positions_m, points.normals, points.intensities, transform, surface,
-            target.grey, intrinsics, limits, model, partials,
+            start, stop, bounds, points.positions_m, points.normals, points.intensities, transform, target.grey,
+            intrinsics, model, partials,
         )  # fmt: skip
 
     run_ranges(parts, body)
@@ -123,6 +122,25 @@ def photometric_sums(
     full[:, rows, columns] = partials[:, :45]
     full[:, columns, rows] = partials[:, :45]
     return PhotometricSums(full[:, :8, :8], full[:, :8, 8], partials[:, 45].astype(np.int64))
+
+
+def seen_points(
+    points: LitPoints, target: LitTarget, T_target_source: Float64, gate_m: float, min_cosine: float
+) -> tuple[LitPoints, Float32]:
+    """Return the M points that the frame sees, and its brightness there (M,).
+
+    The surface behind the pixel of such a point is within `gate_m` of it, and the cosine of their normals is above
+    `min_cosine`, as in :func:`sightings`.
+    """
+    # One more than there are: the kernel writes every point where the next seen one goes.
+    values, frame = np.empty((7, len(points) + 1), np.float32), np.empty(len(points) + 1, np.float32)
+    seen = kernels.list_seen(
+        points.positions_m, points.normals, points.intensities, T_target_source[:3].astype(np.float32),
+        target.surface.surface.reshape(-1, 8), target.grey, intrinsics_array(target.surface.camera),
+        np.array([gate_m, min_cosine], np.float32), values, frame,
+    )  # fmt: skip
+    values = np.ascontiguousarray(values[:, :seen])
+    return LitPoints(values[:3], values[3:6], values[6]), frame[:seen]
 
 
 @dataclass(frozen=True, slots=True)
@@ -209,7 +227,8 @@ def estimate_brightness(
     Robust regression with Student's t and the median absolute deviation as the scale; None where too little is seen.
     """
     few = points.every(max(1, len(points) // SCALE_SAMPLES))
-    model, frame = brightness_samples(few, target, T_target_source, gate_m, min_cosine)
+    few, seen_brightness = seen_points(few, target, T_target_source, gate_m, min_cosine)
+    model, frame = few.intensities.astype(np.float64), seen_brightness.astype(np.float64)
     if len(model) < MIN_SAMPLES:
         return None
     gain, offset = 1.0, _median(frame - model)
@@ -224,19 +243,6 @@ def estimate_brightness(
         gain = float((weights @ ((model - mean_model) * (frame - mean_frame)) + 1 / GAIN_STD**2) / spread)
         offset = float(mean_frame - gain * mean_model)
     return Brightness(gain, offset, scale)
-
-
-def brightness_samples(
-    points: LitPoints, target: LitTarget, T_target_source: Float64, gate_m: float, min_cosine: float
-) -> Float64:
-    """Return the brightness of the points that the frame sees, and the frame's there (2, M), as `sightings` does."""
-    samples = np.empty((2, len(points) + 1), np.float32)
-    seen = kernels.sample_brightness(
-        points.positions_m, points.normals, points.intensities, T_target_source[:3].astype(np.float32),
-        target.surface.surface.reshape(-1, 8), target.grey, intrinsics_array(target.surface.camera),
-        np.array([gate_m, min_cosine], np.float32), samples,
-    )  # fmt: skip
-    return samples[:, :seen].astype(np.float64)
 
 
 def _median(values: Float64) -> float:
