@@ -1,8 +1,10 @@
 """How accurate the whole main job is, on every recorded sequence that is at hand. Prints a table, or JSON.
 
-    python benchmarks/accuracy.py [--data FOLDER] [--json]
+    python benchmarks/accuracy.py [--data FOLDER] [--json] [--check | --store]
 
-One default configuration for all; nothing is tuned per sequence.
+One default configuration for all; nothing is tuned per sequence. `--check` compares the errors with those that are
+stored beside this file and ends with 1 where one is worse by more than the tolerance; `--store` stores them, after a
+change that was meant to be one.
 """
 
 from __future__ import annotations
@@ -10,6 +12,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -21,6 +24,12 @@ import scanweld as sw
 from scanweld.evaluation.surface_metrics import depth_completeness
 from scanweld.geometry import se3
 
+STORED = Path(__file__).parent / "accuracy.json"
+"""Errors, in mm, or percent of the input that the map does not cover."""
+
+TOLERANCE, FLOOR = 0.05, 0.02
+"""Share, and mm or percent, by which an error may grow."""
+
 PAIRS = ((10, 40), (100, 130), (10, 50), (10, 100), (100, 200))
 
 
@@ -30,13 +39,32 @@ def main() -> None:
     default = os.environ.get("SCANWELD_DATA") or Path(__file__).parents[2] / "shared" / "data"
     parser.add_argument("--data", type=Path, default=Path(default))
     parser.add_argument("--json", action="store_true")
+    parser.add_argument("--check", action="store_true")
+    parser.add_argument("--store", action="store_true")
     arguments = parser.parse_args()
     rows = [*trajectories(arguments.data), *fusion(arguments.data), *pairs(arguments.data), *rendered()]
     if arguments.json:
         print(json.dumps(rows, indent=1))
-        return
-    for row in rows:
-        print(f"{row['what']:<62} {row['measured']:<44} asked: {row['asked']}")
+    else:
+        for row in rows:
+            print(f"{row['what']:<62} {row['measured']:<44} asked: {row['asked']}")
+    if arguments.store:
+        errors = {row["what"]: round(row["error"], 4) for row in rows}
+        STORED.write_text(json.dumps(errors, indent=1) + "\n")
+    if arguments.check:
+        worse = list(worse_than(json.loads(STORED.read_text()), rows))
+        print("\n".join(worse) or "nothing is worse than what is stored", file=sys.stderr)
+        sys.exit(bool(worse))
+
+
+def worse_than(stored: dict[str, float], rows: list[dict[str, Any]]) -> Iterator[str]:
+    """Name what is worse than it was, or missing; another processor rounds differently, so errors differ a little."""
+    errors = {row["what"]: row["error"] for row in rows}
+    for what, before in stored.items():
+        if what not in errors:
+            yield f"{what}: not measured"
+        elif not errors[what] <= before * (1 + TOLERANCE) + FLOOR:
+            yield f"{what}: {errors[what]:.4f}, {before:.4f} before"
 
 
 def trajectories(data: Path) -> Iterator[dict[str, Any]]:
@@ -63,8 +91,9 @@ def with_and_without_brightness(sequence: sw.RgbdSequence, name: str, asked: str
         for photometry in ("auto", "off")
     )
     change = auto["ate_rmse_m"] / off["ate_rmse_m"] - 1
-    yield row(name, trajectory_text(auto), asked)
-    yield row(f"  with photometry = off: then auto is {change:+.0%}", trajectory_text(off), "auto at most 5 % worse")
+    yield row(name, trajectory_text(auto), asked, 1e3 * auto["ate_rmse_m"])
+    text = f"{trajectory_text(off)}; auto is {change:+.0%}"
+    yield row(f"{name}, photometry = off", text, "auto at most 5 % worse", 1e3 * off["ate_rmse_m"])
 
 
 def trajectory_text(metrics: Any) -> str:
@@ -89,6 +118,7 @@ def fusion(data: Path) -> Iterator[dict[str, Any]]:
             f"livingroom1 --scale 0.5 --frames 0:200, {kind} poses",
             f"ratio {summary.metrics['compression_ratio']:.1f}, {share:.2%} within 1 cm",
             "ratio > 11.28, >= 99 % within 1 cm",
+            100 * (1 - share),
         )
 
 
@@ -99,7 +129,7 @@ def pairs(data: Path) -> Iterator[dict[str, Any]]:
     for a, b in PAIRS:
         result = sw.align_frames(sequence.read(a), sequence.read(b))
         asked = "1 mm, 0.1 deg" if (a, b) in PAIRS[:2] else "1 cm, 0.5 deg"
-        yield row(f"livingroom1 {a} -> {b}", pair_text(result, se3.inverse(truth[b]) @ truth[a]), asked)
+        yield pair_row(f"livingroom1 {a} -> {b}", result, se3.inverse(truth[b]) @ truth[a], asked)
     camera = sw.PinholeCamera(525, 525, 319.5, 239.5, 640, 480)
     for case in sorted((data / "tum_pairs").glob("case_*")):
         frames, poses = [], []
@@ -109,19 +139,19 @@ def pairs(data: Path) -> Iterator[dict[str, Any]]:
             frames.append(sw.Frame(0.0, depth, None, camera))
             poses.append(se3.from_quaternion_xyzw(values[3:], values[:3]))
         result = sw.align_frames(*frames)
-        yield row(f"tum_pairs {case.name}", pair_text(result, se3.inverse(poses[1]) @ poses[0]), "5 mm, 0.7 deg")
+        yield pair_row(f"tum_pairs {case.name}", result, se3.inverse(poses[1]) @ poses[0], "5 mm, 0.7 deg")
 
 
-def pair_text(result: sw.RegistrationResult, T_true: np.ndarray) -> str:
+def pair_row(what: str, result: sw.RegistrationResult, T_true: np.ndarray, asked: str) -> dict[str, Any]:
     """Status and error of a two-frame alignment."""
     error = se3.inverse(T_true) @ result.T_target_source
-    shift, turn = np.linalg.norm(error[:3, 3]) * 1e3, np.degrees(se3.rotation_angle_rad(error))
-    return f"{result.status.value}: {shift:.2f} mm, {turn:.3f} deg"
+    shift, turn = float(np.linalg.norm(error[:3, 3]) * 1e3), np.degrees(se3.rotation_angle_rad(error))
+    return row(what, f"{result.status.value}: {shift:.2f} mm, {turn:.3f} deg", asked, shift)
 
 
-def row(what: str, measured: str, asked: str) -> dict[str, Any]:
+def row(what: str, measured: str, asked: str, error: float) -> dict[str, Any]:
     """One line of the table."""
-    return {"what": what, "measured": measured, "asked": asked}
+    return {"what": what, "measured": measured, "asked": asked, "error": error}
 
 
 if __name__ == "__main__":
