@@ -91,6 +91,8 @@ def check_brims(brims: list[Brim]) -> Judgement:
     surfaces = {zoom: np.sum([_shifted_scores(brim, zoom) for brim in brims], axis=0) / num_points for zoom in ZOOMS}
     reach = surfaces[1.0].shape[0] // 2
     as_is, spread = float(surfaces[1.0][reach, reach]), float(np.std(surfaces[1.0]))
+    if not spread > 0:  # pictures without any edge
+        return [], dict.fromkeys(names)
     zoom = max(ZOOMS, key=lambda z: float(np.max(surfaces[z])))
     dy, dx = np.array(np.unravel_index(np.argmax(surfaces[zoom]), surfaces[zoom].shape)) - reach
     moved_score = float(np.max(surfaces[zoom]))

@@ -89,7 +89,7 @@ def _check_motions(sequence: RgbdSequence, evidence: Evidence) -> Judgement:
     """Judge intrinsics and truth by the motions between frames; each would make the other look wrong."""
     focal, figures = check_focal_length(evidence.camera, sequence.camera, evidence.pairs)
     figures = {**_NO_MOTIONS, **figures}
-    if sequence.ground_truth is None:
+    if not sequence.ground_truth:
         return focal, figures
     truth, against = check_truth(
         sequence.ground_truth, sequence.timestamps_s, measured_motions(evidence.pairs), evidence.median_depth_m,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,20 +21,29 @@ FOCAL_FACTORS = (0.6, 0.68, 0.77, 0.88, 1.0, 1.14, 1.3, 1.48, 1.68)
 WRONG_FOCAL = 1.15
 """Factor between the stated focal length and the best one from which on it is told."""
 
-_LEAST_TURN_RAD = np.deg2rad(3.0)  # without a turn, any focal length fits
 LEAST_PAIRS = 3
 """Fewer pairs of views tell nothing."""
 
+_LEAST_TURN_RAD = np.deg2rad(3.0)  # without a turn, any focal length fits
 _LEAST_LOSS = 100.0  # that a better focal length saves, in squares of standard deviations
 _SIGMAS = 3.0
 
-AXIS_FLIPS = {"z backwards and y up, as in OpenGL": np.diag([1.0, -1.0, -1.0, 1.0])}
-_MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
+_AS_IT_IS, _INVERTED = "as it is", "inverted"
+_BACKWARDS, _MIRROR = np.diag([1.0, -1.0, -1.0, 1.0]), np.diag([1.0, -1.0, 1.0, 1.0])
+READINGS: dict[str, Callable[[Float64], Float64]] = {
+    _AS_IT_IS: lambda T: T,
+    _INVERTED: se3.inverse,
+    "with z backwards and y up, as in OpenGL,": lambda T: T @ _BACKWARDS,
+    "mirrored, with y up, as in ICL-NUIM,": lambda T: _MIRROR @ T @ _MIRROR,
+}
+"""What a true pose (4, 4) may have been meant to be: T_world_camera by how it is read."""
+
 AGREES = 0.35
 """Disagreement of two motions, relative to their size, below which they are the same."""
 
 WRONG_SCALE = 1.6
-_MILLIMETRES, _NEAR = 1000.0, 1.5
+"""Factor between measured and true lengths that no error of the features explains."""
+
 _LEAST_MOTION_M, _LEAST_MOTION_RAD = 0.02, np.deg2rad(1.5)
 
 
@@ -120,16 +130,12 @@ def check_truth(
     moved = [(motion, *poses) for motion, poses in known if poses is not None and _moves(motion)]
     if len(moved) < LEAST_PAIRS:
         return [], nothing
-    readings = {"as it is": _disagreement(moved, np.eye(4), inverted=False)}
-    readings["inverted"] = _disagreement(moved, np.eye(4), inverted=True)
-    for name, flip in AXIS_FLIPS.items():
-        readings[name] = _disagreement(moved, flip, inverted=False)
-    readings["mirrored, y up, as in ICL-NUIM"] = _disagreement(moved, _MIRROR, inverted=False, mirrored=True)
-    wrong, scale = readings["as it is"]
+    found = {name: _disagreement(moved, read) for name, read in READINGS.items()}
+    wrong, scale = found[_AS_IT_IS]
     figures: Figures = {"truth_disagreement": wrong, "truth_scale": scale}
-    best = min(readings, key=lambda name: readings[name][0])
     if wrong > AGREES:
-        return [_misread(best if readings[best][0] < min(AGREES, wrong / 2) else "", wrong)], figures
+        best = min(found, key=lambda name: found[name][0])
+        return [_misread(best if found[best][0] < min(AGREES, wrong / 2) else "", wrong)], figures
     if max(scale, 1 / scale) < WRONG_SCALE:
         return [], figures
     return [_wrong_scale(scale, median_depth_m, depth_scale)], figures
@@ -152,50 +158,35 @@ def _moves(motion: Motion) -> bool:
 
 
 def _disagreement(
-    moved: list[tuple[Motion, Float64, Float64]], flip: Float64, *, inverted: bool, mirrored: bool = False
+    moved: list[tuple[Motion, Float64, Float64]], read: Callable[[Float64], Float64]
 ) -> tuple[float, float]:
-    """Return how much measured and true motions differ, relative to their size, and the ratio of their lengths.
-
-    The true pose is read as it is or inverted, with camera axes (and, mirrored, world axes) turned by `flip`.
-    """
+    """Return how much measured and true motions differ, relative to their size, and the ratio of their lengths."""
     measured = np.array([motion.T_target_source for motion, _, _ in moved])
-    true = []
-    for _, *poses in moved:
-        T_source, T_target = (_read(T, flip, inverted=inverted, mirrored=mirrored) for T in poses)
-        true.append(se3.inverse(T_target) @ T_source)
-    claimed = np.array(true)
-    lengths = np.linalg.norm(claimed[:, :3, 3], axis=1)
-    ratio = float(np.median(np.linalg.norm(measured[:, :3, 3], axis=1) / np.maximum(lengths, 1e-9)))
-    turn = se3.rotation_angle_rad(se3.inverse(claimed) @ measured) / se3.rotation_angle_rad(measured)
-    shift = np.linalg.norm(measured[:, :3, 3] - ratio * claimed[:, :3, 3], axis=1) / np.linalg.norm(
-        measured[:, :3, 3], axis=1
-    )
+    true = np.array([se3.inverse(read(T_target)) @ read(T_source) for _, T_source, T_target in moved])
+    lengths, true_lengths = (np.linalg.norm(T[:, :3, 3], axis=1) for T in (measured, true))
+    ratio = float(np.median(lengths / np.maximum(true_lengths, 1e-9)))
+    turn = se3.rotation_angle_rad(se3.inverse(true) @ measured) / se3.rotation_angle_rad(measured)
+    shift = np.linalg.norm(measured[:, :3, 3] - ratio * true[:, :3, 3], axis=1) / lengths
     return float(np.median(turn) + np.median(shift)) / 2, ratio
-
-
-def _read(T: Float64, flip: Float64, *, inverted: bool, mirrored: bool) -> Float64:
-    T_world_camera = se3.inverse(T) if inverted else T
-    return flip @ T_world_camera @ flip if mirrored else T_world_camera @ flip
 
 
 def _misread(reading: str, wrong: float) -> Finding:
     seen = f"the motions it tells differ from those that the images show by {wrong:.0%} of their size"
-    if reading == "inverted":
+    if reading == _INVERTED:
         fix = "give poses from camera to world: invert each"
         return Finding("truth-inverted", Level.WARNING, f"{seen}; inverted it agrees", fix)
     if reading:
         fix = "give poses of a camera with x right, y down, z forward (docs/conventions.md)"
-        return Finding("truth", Level.WARNING, f"{seen}; with its axes {reading}, it agrees", fix)
+        return Finding("truth", Level.WARNING, f"{seen}; {reading} it agrees", fix)
     return Finding("truth", Level.WARNING, seen, "is it of this recording, and on the clock of the images?")
 
 
 def _wrong_scale(scale: float, median_depth_m: float, depth_scale: float) -> Finding:
-    """Say whether the truth or the depth has another unit; `scale` is measured over true lengths."""
+    """Say whether the truth or the depth has another unit; `scale` is of the measured lengths over the true ones."""
     seen = f"the camera moves {scale:.3g} times as far in the images as in the ground truth"
-    plausible = check_depth_unit(median_depth_m, depth_scale) is None
-    if plausible and 1 / _NEAR < scale * _MILLIMETRES < _NEAR:
-        return Finding("truth-unit", Level.WARNING, f"{seen}: that is in millimetres", "divide its positions by 1000")
     right = likely_depth_scale(depth_scale * scale)
-    return Finding(
-        "depth-unit", Level.ERROR, seen, f"pass --depth-scale {right:g} (units per metre), if the truth is right"
-    )
+    if check_depth_unit(median_depth_m / scale, right) is not None:  # the scene would have no such depth
+        factor = float(f"{1 / scale:.1g}")
+        return Finding("truth-unit", Level.WARNING, seen, f"write its positions in metres: divide them by {factor:g}")
+    fix = f"pass --depth-scale {right:g} (units per metre), if the truth is right"
+    return Finding("depth-unit", Level.ERROR, seen, fix)
