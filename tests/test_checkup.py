@@ -16,7 +16,7 @@ import scanweld as sw
 from rendered import MemorySequence, rendered
 from scanweld.checkup.evidence import plan_bursts
 from scanweld.checkup.examine import examine, examine_input
-from scanweld.checkup.findings import WHY, Level
+from scanweld.checkup.findings import FIGURES, WHY, Level
 from scanweld.checkup.first_look import FirstLook
 from scanweld.checkup.pictures import edge_spread
 from scanweld.checkup.repeats import check_repeats
@@ -47,6 +47,7 @@ def test_a_sound_recording_has_no_finding() -> None:
     assert checkup.num_frames == 66
     assert 40 < checkup.num_looked_at <= 66
     assert [name for name, value in checkup.figures.items() if value is None] == []
+    assert set(checkup.figures) == set(FIGURES)
 
 
 @pytest.mark.parametrize("fault", [name for name, made in SPOILS.items() if made.sequence])
@@ -86,8 +87,13 @@ def test_no_false_alarm_on_recordings(shared_data: Path) -> None:
         assert faults(sw.open_sequence(shared_data / name)) == []
 
 
-def test_every_fault_says_why() -> None:
+def test_every_fault_says_why_and_is_on_the_page() -> None:
+    docs = Path(__file__).parents[1] / "docs"
     assert set(SPOILS) <= set(WHY)
+    page = (docs / "check.md").read_text(encoding="utf-8")
+    assert [fault for fault in WHY if fault not in page] == []
+    page = (docs / "synthetic.md").read_text(encoding="utf-8")
+    assert [fault for fault in SPOILS if fault not in page] == []
 
 
 def test_an_unknown_fault_is_an_error() -> None:

@@ -39,6 +39,28 @@ WHY = {
 }
 """Every fault by name, and why it matters."""
 
+FIGURES = {
+    "interval_s": "time from frame to frame [s]",
+    "longest_gap": "longest time between frames, in usual ones",
+    "principal_point_aside": "principal point beside the centre, share of the size",
+    "pixel_ratio": "ratio of the focal lengths",
+    "median_depth_m": "median depth [m]",
+    "valid_share": "share of the pixels that have depth",
+    "unreadable_share": "share of the frames that cannot be decoded",
+    "repeated_share": "share of the frames that repeat the one before",
+    "edge_spread_px": "pixels that sharp edges spread over",
+    "brightness_factor": "largest change of brightness, a factor",
+    "displacement": "way of the features from frame to frame, share of the width",
+    "color_misplaced": "best place of the colour beside its own, share of the width",
+    "color_misplaced_sigmas": "how much better it is there, standard deviations",
+    "color_lag_frames": "best moment of the colour after its own [frames]",
+    "color_lag_sigmas": "how much better it is then, standard deviations",
+    "focal_factor": "best focal length over the one given",
+    "truth_disagreement": "difference of true and seen motions, share of their size",
+    "truth_scale": "length of the seen motions over the true ones",
+}
+"""Everything that is measured, by name, in the order in which it is shown."""
+
 
 @dataclass(frozen=True, slots=True)
 class Finding:

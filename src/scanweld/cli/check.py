@@ -65,6 +65,8 @@ def check(
 
 def _lines(checkup: Checkup, seconds: float) -> Iterator[str]:
     """The findings, those that weigh most first, and what was measured, for a person."""
+    from scanweld.checkup.findings import FIGURES
+
     looked = f"looked at {checkup.num_looked_at} of {checkup.num_frames} frames in {seconds:.1f} s"
     if checkup.sound:
         verdict = "nothing wrong was found"
@@ -79,6 +81,7 @@ def _lines(checkup: Checkup, seconds: float) -> Iterator[str]:
             yield textwrap.fill(text, COLUMNS, initial_indent=f"  {name:<5} ", subsequent_indent=" " * 8)
     if checkup.figures:
         yield ""
-        width = max(map(len, checkup.figures))
-        for name, value in checkup.figures.items():
-            yield f"  {name:<{width}}  {'not to be told' if value is None else f'{value:.4g}'}"
+        width = max(map(len, FIGURES.values()))
+        for name, words in FIGURES.items():
+            value = checkup.figures[name]
+            yield f"  {words:<{width}}  {'not to be told' if value is None else f'{value:.3g}'}"
