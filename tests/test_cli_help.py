@@ -11,15 +11,17 @@ from typing import Any
 
 import pytest
 import typer
+import typer.main
 
 from scanweld.cli.app import app
 from scanweld.cli.usage import in_plain_words
 
 OPTIONS = {
-    "demo": "--out --frames --threads --json",
+    "demo": "--out --frames --threads --force --json",
     "check": "--format --topics --camera --depth-scale --frames --json",
     "slam": "--out --format --camera --depth-scale --frames --scale --poses --config --set --threads --force --json "
-    "--tracked-only --topics --refine --calibrate",
+    "--tracked-only --topics --refine --calibrate --realtime --resume --checkpoint-every --view --view-host "
+    "--view-port --rerun",
     "register": "--method --scale --init --global --voxel --max-distance --set --threads --explain --plot --out --json",
     "evaluate": "--align --json --plot",
     "render": "--out --scene --path --path-frame --noise --frames --size --fps --spoil --seed --force",
@@ -33,7 +35,7 @@ OPTIONS = {
     "datasets": "--format",
     "completion": "",
 }
-"""What every command must offer."""
+"""What every command offers."""
 
 
 def scanweld(*arguments: str, columns: int = 100, **environment: str) -> subprocess.CompletedProcess[str]:
@@ -58,6 +60,13 @@ def test_help_names_every_option(command: str, columns: int) -> None:
     done = scanweld(command, "--help", columns=columns)
     assert (done.returncode, done.stderr) == (0, "")
     assert set(OPTIONS[command].split()) <= set(re.findall(r"--[a-z-]+", done.stdout))
+
+
+@pytest.mark.parametrize("command", OPTIONS)
+def test_every_option_is_covered_here(command: str) -> None:
+    parser = typer.main.get_command(app).commands[command]  # type: ignore[attr-defined]
+    offered = {name for parameter in parser.params for name in parameter.opts if name.startswith("--")}
+    assert offered - {"--help"} == set(OPTIONS[command].split())
 
 
 def test_help_names_every_format() -> None:
