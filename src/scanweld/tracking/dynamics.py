@@ -185,7 +185,7 @@ def _supported(level: SurfaceLevel, view: ModelView, T_world_camera: Float64) ->
             level.surface, parameters, supported,
         )  # fmt: skip
 
-    run_ranges(len(confidences) // stride, body)
+    run_ranges(-(-len(confidences) // stride), body)
     return supported
 
 

@@ -48,7 +48,7 @@ def mark_supported(
     """
     height, width = supported.shape
     half = np.float32(0.5)
-    for i in range(start * stride, stop * stride, stride):
+    for i in range(start * stride, min(stop * stride, len(confidences)), stride):
         if confidences[i] < stable:
             continue
         x, y, z = positions[0, i], positions[1, i], positions[2, i]
