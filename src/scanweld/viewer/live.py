@@ -126,7 +126,7 @@ class LiveView:
         self._rate.count()
         self._put(slam, frame, result)
         if self.watched:
-            if self._map.due:
+            if self._map.due():
                 self._map.copy(slam.mapper, self._panel.coloring, _seen(frame, result))
             self._news.set()
 
@@ -134,7 +134,7 @@ class LiveView:
         """Whether the run may go on: nobody holds it, in the browser."""
         if self.gate.wait(timeout_s):
             return True
-        if self._slam is not None and self.watched and self._map.due:  # not all may be drawn, or in old colours
+        if self._slam is not None and self.watched and self._map.due(held=True):  # not all is drawn, or in old colours
             self._map.copy(self._slam.mapper, self._panel.coloring)
             self._news.set()
         return False

@@ -48,13 +48,12 @@ class LiveMap:
         self._next_s = 0.0
         self._next_work_s = 0.0
 
-    @property
-    def due(self) -> bool:
-        """Whether it is time to copy what changed."""
+    def due(self, *, held: bool = False) -> bool:
+        """Whether it is time to copy what changed; a run that is `held` leaves all processors to the view."""
         late_s = time.monotonic() - self._next_s
         if self._copied is not None or late_s < 0:
             return False
-        return late_s > AT_LEAST_S or time.process_time() >= self._next_work_s
+        return held or late_s > AT_LEAST_S or time.process_time() >= self._next_work_s
 
     def copy(self, mapper: Mapper, coloring: Coloring, planes: Float64 | None = None) -> None:
         """Copy what changed of a mapper's map, as soon as all frames are fused; does not wait for that.
