@@ -13,7 +13,7 @@ from scanweld.geometry.depth import SurfacePyramid
 from scanweld.geometry.views import MapCorrection, ModelView
 from scanweld.mapping.backends.arrays import DepthBuffers
 from scanweld.mapping.fusion import FusionConfig, FusionCounts, fuse
-from scanweld.mapping.merging import merge_doubled
+from scanweld.mapping.merging import merge_doubled, thin_crowded
 from scanweld.mapping.rendering import find_candidates, render_model_view
 from scanweld.mapping.storage.pages import MapConfig
 from scanweld.mapping.surfel_map import SurfelMap
@@ -93,8 +93,10 @@ class SurfelMapper(Stateful):
         """Let some of the map follow the last corrections, or all of it, and fuse layers that this brings together."""
         pages = self.map.pages
         pages.follow(pages.capacity if everything else PAGES_A_FRAME)
-        at_most = 0 if everything else PAGES_A_FRAME
-        merge_doubled(self.map, self.config.max_confidence, self.config.merging, at_most=at_most)
+        at_most, most = 0 if everything else PAGES_A_FRAME, self.config.max_confidence
+        merge_doubled(self.map, most, self.config.merging, at_most=at_most)
+        if not everything:
+            thin_crowded(self.map, most)
 
 
 def shows_the_same(view: ModelView, T_world_camera: Float64, camera: PinholeCamera) -> bool:

@@ -14,12 +14,14 @@ import numpy as np
 from scanweld.arrays import Bool, Float32, Int64
 from scanweld.config import check_ranges, setting
 from scanweld.mapping.merging import kernels
-from scanweld.mapping.storage.pages import PagePool
+from scanweld.mapping.storage.pages import NEVER, PagePool
 from scanweld.mapping.surfel_map import SurfelMap
 
 _COSINE = 0.7
 _RADIUS_CLASS = 1.5  # surfels within this factor are equally fine; Keller et al. 2013 refine by the same factor
 _MOVED_M = 0.002  # apart: less than this and the layers lie as they lay before
+_SAME_PLACE_M, _SAME_PLACE_SHARE = 0.02, 0.5  # along the normal, and of the larger of two radii
+_CROWDED = 16  # surfels that have come to a page
 _SIDE_M = 0.015  # of the small cells in which a surfel looks for others
 _MOST_SIDES = 64  # of these in a row
 
@@ -61,21 +63,45 @@ def merge_doubled(surfels: SurfelMap, most: float, config: MergingConfig | None 
     while len(cells := meetings.among(config.gap, _MOVED_M)):
         for cell in cells.tolist():
             meetings.list(cell)  # before: pages around it may follow only now, into this cell or another
-            num, fewer = _merge_cell(surfels.pages, cell, most, config)
+            limits = (config.distance_m, _COSINE, most, 1.0)
+            num, fewer = _merge_cell(surfels.pages, cell, config.gap, limits)
             looked_at, gone = looked_at + num, gone + fewer
             if 0 < at_most <= looked_at:
                 return gone
     return gone
 
 
-def _merge_cell(pages: PagePool, cell: int, most: float, config: MergingConfig) -> tuple[int, int]:
-    """Let the surfels of a cell take in others, also of cells around it; returns the pages looked at, and who went."""
+def thin_crowded(surfels: SurfelMap, most: float) -> int:
+    """Fuse surfels that share a place, in the cell where most have come since it was looked at; returns who went.
+
+    Noise adds surfels to surfaces that are known, again and again; without this a map grows with the time, not with the
+    places. Only pages without anything unstable are looked at: most of what is new does not last anyway.
+    """
+    pages = surfels.pages
+    more = np.where(pages.probation == NEVER, pages.counts - pages.thinned, 0)
+    slot = int(more.argmax())
+    if more[slot] < _CROWDED:
+        return 0
+    cell = int(pages.cells[slot])
+    _, gone = _merge_cell(pages, cell, 0, (_SAME_PLACE_M, _COSINE, most, _SAME_PLACE_SHARE))
+    mine = pages.cells == cell
+    pages.thinned[mine] = pages.counts[mine]
+    pages.thinned[slot] = pages.counts[slot]  # it may be that of no cell
+    return gone
+
+
+def _merge_cell(pages: PagePool, cell: int, gap: int, limits: tuple[float, float, float, float]) -> tuple[int, int]:
+    """Let the surfels of a cell take in others, also of cells around it; returns the pages looked at, and who went.
+
+    `limits` : distance along the normal [m], cosine of the normals, largest confidence, share of the larger disc
+    """
+    distance_m, cosine, most, share = limits
     mine = np.flatnonzero(pages.cells == cell)
     if len(mine) == 0:
         return 0, 0
     pages.use(mine)
     own, rows = pages.numbers_in(mine), pages.rows_in(mine)
-    count, reach = len(own), np.float32(config.distance_m + rows[7].max())
+    count, reach = len(own), np.float32(distance_m + share * rows[7].max())
     slots, others, around = _within(pages, mine, rows[0:3].min(axis=1) - reach, rows[0:3].max(axis=1) + reach)
     numbers, rows = np.concatenate([own, others]), np.concatenate([rows, around], axis=1)
     p, n, c, r, weights = rows[0:3], rows[3:6], rows[8:11], rows[7], rows[6]
@@ -88,10 +114,10 @@ def _merge_cell(pages: PagePool, cell: int, most: float, config: MergingConfig) 
     starts, members, lattice = _by_cells(p - origin[:, None], side)
     changed: Bool = np.zeros(len(numbers), np.bool_)
     taken: Bool = np.zeros(len(numbers), np.bool_)
-    limits = np.array([config.distance_m, _COSINE, most, r.max()], np.float32)
+    values = np.array([distance_m, cosine, most, r.max(), share], np.float32)
     kernels.merge_layers(
         ranking[ranking < count], place, starts, members, lattice, origin, p, n, c, r, weights, rows[13].view(np.int32),
-        config.gap, limits, side, changed, taken,
+        gap, values, side, changed, taken,
     )  # fmt: skip
     pages.put(numbers[changed], rows[:, changed])
     pages.fit_boxes(mine)

@@ -18,9 +18,9 @@ def merge_layers(
     (cells + 1,) int64, members (M,) int64: surfels by cells of a lattice of that shape (3,) int64 and that side, from
     that origin (3,) float32; positions, normals, colors (3, M), radii, confidences (M,) float32; anchors (M,) int32.
     gap: keyframes between two passes; limits: distance along the normal [m], cosine of the normals, largest confidence,
-    largest radius [m]. changed, taken (M,) bool are written.
+    largest radius [m], share of the larger disc that is taken from. changed, taken (M,) bool are written.
     """
-    distance, min_cosine, most, widest = limits[0], limits[1], limits[2], limits[3]
+    distance, min_cosine, most, widest, share = limits[0], limits[1], limits[2], limits[3], limits[4]
     half = np.float32(0.87) * side  # no point of a cell is further from its middle: sqrt(3) / 2
     sums, low, high = np.empty(6, np.float32), np.empty(3, np.int64), np.empty(3, np.int64)
     # What a cell holds at most: most of them are passed over as a whole.
@@ -39,7 +39,7 @@ def merge_layers(
         x, y, z = positions[0, k], positions[1, k], positions[2, k]
         nx, ny, nz = normals[0, k], normals[1, k], normals[2, k]
         for axis in range(3):
-            extent = distance * abs(normals[axis, k]) + widest
+            extent = distance * abs(normals[axis, k]) + share * widest
             low[axis] = max(np.int64(0), np.int64(np.floor((positions[axis, k] - origin[axis] - extent) / side)))
             high[axis] = min(lattice[axis] - 1, np.int64(np.floor((positions[axis, k] - origin[axis] + extent) / side)))
         weight, height, num = confidences[k], np.float32(0), 0
@@ -56,7 +56,7 @@ def merge_layers(
                     dy = origin[1] + (np.float32(cy) + np.float32(0.5)) * side - y
                     dz = origin[2] + (np.float32(cz) + np.float32(0.5)) * side - z
                     h = nx * dx + ny * dy + nz * dz
-                    reach = max(radii[k], largest[cell]) + half
+                    reach = share * max(radii[k], largest[cell]) + half
                     if (abs(h) > distance + half) | (dx * dx + dy * dy + dz * dz - h * h > reach * reach):
                         continue
                     for m in range(starts[cell], starts[cell + 1]):
@@ -66,7 +66,7 @@ def merge_layers(
                         dx, dy, dz = positions[0, j] - x, positions[1, j] - y, positions[2, j] - z
                         h = nx * dx + ny * dy + nz * dz
                         lateral = dx * dx + dy * dy + dz * dz - h * h
-                        reach = max(radii[k], radii[j])
+                        reach = share * max(radii[k], radii[j])
                         cosine = nx * normals[0, j] + ny * normals[1, j] + nz * normals[2, j]
                         if abs(h) > distance or lateral > reach * reach or cosine < min_cosine:
                             continue

@@ -84,6 +84,7 @@ class PagePool(Stateful):
     cells : (capacity,) int64, key of the cell that each page fills
     probation : (capacity,) int32, first frame of what may be unstable in each page
     dirty : (capacity,) uint8, pages with a surfel that lost confidence
+    thinned : (capacity,) int32, surfels of each page when it was last looked at for crowds
     epochs : (capacity,) int32, corrections that each page has followed
     corrections : what pages of earlier epochs have still to follow
     total : surfels of all pages
@@ -91,7 +92,7 @@ class PagePool(Stateful):
 
     STATE: ClassVar = {
         "counts": Int32, "boxes": Float32, "shelves": Float32, "cells": Int64, "probation": Int32, "dirty": UInt8,
-        "epochs": Int32, "corrections": Stateful, "_behind": int, "total": int, "_looks": int,
+        "thinned": Int32, "epochs": Int32, "corrections": Stateful, "_behind": int, "total": int, "_looks": int,
         "_waiting": dict[int, list[Int32]], "_keys": Int64, "_tails": Int32,
         "_room": int, "free": Int32, "contents": Iterator[Float32],
     }  # fmt: skip
@@ -124,6 +125,7 @@ class PagePool(Stateful):
     probation: Int32
     dirty: UInt8
     epochs: Int32
+    thinned: Int32
 
     @property
     def whole(self) -> Int32:
@@ -327,6 +329,7 @@ class PagePool(Stateful):
         for some in self.batches(slots):
             run_ranges(len(some), partial(body, some=some), grain=8)
         self.dirty[slots] = 0
+        self.thinned[slots] = np.minimum(self.thinned[slots], self.counts[slots])
         after, since = self.counts[slots], self.probation[slots]
         self.total -= int((before - after).sum())
         for first in np.unique(since[(after > 0) & (since < NEVER)]).tolist():
@@ -352,7 +355,7 @@ class PagePool(Stateful):
             return
         self.use(slots)
         rows = self.rows_in(slots)
-        self.counts[slots] = self.dirty[slots] = 0
+        self.counts[slots] = self.dirty[slots] = self.thinned[slots] = 0
         self.cells[slots] = -1
         self._free[self._num_free : self._num_free + len(slots)] = slots
         self._num_free += len(slots)
@@ -500,5 +503,5 @@ def _columns(capacity: int) -> dict[str, Array]:
         "counts": np.zeros(capacity, np.int32), "boxes": np.zeros((capacity, 6), np.float32), "shelves": boxes,
         "cells": np.full(capacity, -1, np.int64), "probation": np.zeros(capacity, np.int32),
         "dirty": np.zeros(capacity, np.uint8),
-        "epochs": np.zeros(capacity, np.int32),
+        "thinned": np.zeros(capacity, np.int32), "epochs": np.zeros(capacity, np.int32),
     }  # fmt: skip
