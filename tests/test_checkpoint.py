@@ -192,7 +192,10 @@ class TestState:
             ("tails", lambda pages: pages._tails.__setitem__(0, 1 << 20)),
             ("room", lambda pages: setattr(pages, "_room", 10**6)),
             ("calendar", lambda pages: pages._waiting.__setitem__(3, [np.array([-5], np.int32)])),
-            ("free", lambda pages: pages._free.__setitem__(0, pages.live[0])),
+            ("free", lambda pages: pages.regions.left.__setitem__(0, 1)),
+            ("used", lambda pages: pages.regions.used.__setitem__(0, 1)),
+            ("chain", lambda pages: pages.regions.following.__setitem__(0, 0)),
+            ("regions", lambda pages: pages.regions.heads.__setitem__(pages.regions.heads >= 0, -1)),
             ("boxes", lambda pages: setattr(pages, "boxes", pages.boxes[:-1])),
         ],
     )

@@ -339,9 +339,11 @@ def test_far_away_surfels_of_one_cell_share_a_page() -> None:
 
 
 def test_numbers_of_surfels_end_somewhere(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("scanweld.mapping.storage.pages.MOST_PAGES", 300)
+    """300 pages in eight regions take eight shelves of 64; as many again do not fit."""
+    monkeypatch.setattr("scanweld.mapping.storage.pages.MOST_PAGES", 640)
     surfels = sw.SurfelMap(16)
-    surfels.append(*scattered(1, 300), 0)
-    assert (len(surfels), surfels.capacity) == (300, 300 * PAGE)
-    with pytest.raises(sw.InvalidInputError, match="at most 300 pages"):
-        surfels.append(*scattered(2, 300), 1)
+    surfels.append(*scattered(1, 320, 1.99), 0)
+    assert (len(surfels), len(np.unique(surfels.pages.live // 64))) == (320, 8)
+    assert surfels.capacity <= 640 * PAGE
+    with pytest.raises(sw.InvalidInputError, match="at most 640 pages"):
+        surfels.append(*scattered(2, 320, 1.99), 1)

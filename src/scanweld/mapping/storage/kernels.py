@@ -107,6 +107,14 @@ def cell_key(x, y, z, per_cell):
 
 
 @kernel
+def region_key(key):
+    """Key of the region of 8 x 8 x 8 cells that a cell is in."""
+    mask = np.int64((1 << 18) - 1)
+    x, y, z = key >> np.int64(45), (key >> np.int64(24)) & mask, (key >> np.int64(3)) & mask
+    return (x << np.int64(36)) | (y << np.int64(18)) | z
+
+
+@kernel
 def rehash(old_keys, old_tails, cells, keys, tails):
     """Fill a table (2^n,) with the cells of another one that still have a page to fill; returns how many.
 
@@ -150,14 +158,17 @@ def settle_pages(slots, per_cell, counts, boxes, cells, keys, tails):
 
 @kernel
 def deposit(
-    first, rows, per_cell, free, num_free, room, counts, boxes, shelves, cells, probation, keys, tails, pool, numbers
-):
+    first, rows, per_cell, room, counts, boxes, shelves, cells, probation, keys, tails, used, owners, following,
+    regions, heads, free, left, pool, numbers,
+):  # fmt: skip
     """Put surfels rows[:, first:] (ROWS, N) into pages of their cells, until pages or room in the table run out.
 
-    per_cell: cells per metre; free (F,) int32: slots of free pages, the last `num_free` first; room: keys that may
-    still come into the table; counts, boxes, shelves, cells, probation: see `PagePool`; keys (2^n,) int64, -1 where
-    free, tails (2^n,) int32: the table of cells and the page that each fills; numbers (N,) int32: the surfels' numbers.
-    Returns how far it came, the free pages and the room that are left.
+    A new page goes to a shelf of the region that its cell is in: what is in view together leaves memory together.
+
+    per_cell: cells per metre; room: keys that may still come into the table of cells; counts, boxes, shelves, cells,
+    probation: see `PagePool`; keys (2^n,) int64, -1 where free, tails (2^n,) int32: the table of cells and the page
+    that each fills; used, owners, following, regions (its keys), heads, free, left: see `Regions`; numbers (N,) int32:
+    the surfels' numbers. Returns how far it came, and the room that is left.
     """
     for k in range(first, rows.shape[1]):
         x, y, z = rows[0, k], rows[1, k], rows[2, k]
@@ -165,16 +176,32 @@ def deposit(
         entry = find_cell(key, keys)
         if keys[entry] < 0:
             if room == 0:
-                return k, num_free, room
+                return k, room
             keys[entry], tails[entry] = key, -1
             room -= 1
         slot = tails[entry]
         # A page that was released since, and may belong to another cell by now, is no longer this cell's.
         if slot < 0 or (cells[slot] != key) | (counts[slot] == PAGE):
-            if num_free == 0:
-                return k, num_free, room
-            num_free -= 1
-            slot = free[num_free]
+            region = region_key(key)
+            place = find_cell(region, regions)
+            if regions[place] < 0:
+                if left[1] == 0:
+                    return k, room
+                regions[place], heads[place] = region, -1
+                left[1] -= 1
+            shelf = heads[place]
+            while (shelf >= 0) and (used[shelf] == SHELF):
+                shelf = following[shelf]
+            if shelf < 0:
+                if left[0] == 0:
+                    return k, room
+                left[0] -= 1
+                shelf = free[left[0]]
+                owners[shelf], following[shelf], heads[place] = region, heads[place], shelf
+            slot = shelf * SHELF
+            while counts[slot] > 0:
+                slot += 1
+            used[shelf] += 1
             tails[entry], cells[slot], counts[slot] = slot, key, 0
             probation[slot] = 0x7FFFFFFF
             for axis in range(3):
@@ -189,7 +216,7 @@ def deposit(
             shelves[slot // SHELF, 3 + axis] = max(shelves[slot // SHELF, 3 + axis], rows[axis, k])
         numbers[k] = slot * PAGE + counts[slot]
         counts[slot] += 1
-    return rows.shape[1], num_free, room
+    return rows.shape[1], room
 
 
 @kernel

@@ -16,6 +16,7 @@ from scanweld.mapping.storage import kernels
 from scanweld.mapping.storage.backing import MappedFile, Memory
 from scanweld.mapping.storage.corrections import Corrections, farthest_moves
 from scanweld.mapping.storage.kernels import PAGE, ROWS, SHELF, SPAN, STRIDE
+from scanweld.mapping.storage.regions import Regions
 from scanweld.mapping.storage.residence import Residence
 from scanweld.parallel import run_ranges
 from scanweld.state import Stateful
@@ -42,7 +43,7 @@ PART = 512
 SPARSE = PAGE // 4
 """A page that is left with fewer surfels is given up."""
 
-MOST_PAGES = 0x7FFFFFFF // PAGE
+MOST_PAGES = 0x7FFFFFFF // (PAGE * SHELF) * SHELF
 """The number of a surfel is an int32."""
 
 _PER_CELL = np.float32(1 / CELL_M)
@@ -80,7 +81,7 @@ class PagePool(Stateful):
     pool : (capacity * SPAN,) float32, see `kernels`
     counts : (capacity,) int32, surfels of each page
     boxes : (capacity, 6) float32, lower and upper corner of what each page holds [m]
-    shelves : (ceil(capacity / SHELF), 6) float32, around the boxes of each shelf's pages, which may be smaller
+    shelves : (capacity / SHELF, 6) float32, around the boxes of each shelf's pages, which may be smaller
     cells : (capacity,) int64, key of the cell that each page fills
     probation : (capacity,) int32, first frame of what may be unstable in each page
     dirty : (capacity,) uint8, pages with a surfel that lost confidence
@@ -94,9 +95,9 @@ class PagePool(Stateful):
         "counts": Int32, "boxes": Float32, "shelves": Float32, "cells": Int64, "probation": Int32, "dirty": UInt8,
         "thinned": Int32, "epochs": Int32, "corrections": Stateful, "_behind": int, "total": int, "_looks": int,
         "_waiting": dict[int, list[Int32]], "_keys": Int64, "_tails": Int32,
-        "_room": int, "free": Int32, "contents": Iterator[Float32],
+        "_room": int, "regions": Stateful, "contents": Iterator[Float32],
     }  # fmt: skip
-    MADE = frozenset({"config", "_backing", "_residence", "pool", "_free", "_num_free"})
+    MADE = frozenset({"config", "_backing", "_residence", "pool"})
 
     def __init__(self, capacity: int, config: MapConfig | None = None) -> None:
         self.config = config or MapConfig()
@@ -114,8 +115,7 @@ class PagePool(Stateful):
         for name, values in _columns(0).items():
             setattr(self, name, values)
         self.pool: Float32 = np.empty(0, np.float32)
-        self._free: Int32 = np.empty(0, np.int32)
-        self._num_free = 0
+        self.regions = Regions()
         self._grow(max(1, capacity))
 
     counts: Int32
@@ -141,16 +141,6 @@ class PagePool(Stateful):
     def live(self) -> Int64:
         """Slots of the pages with surfels."""
         return np.flatnonzero(self.counts)
-
-    @property
-    def free(self) -> Int32:
-        """Slots of the pages that are free; the last is taken first."""
-        return self._free[: self._num_free]
-
-    @free.setter
-    def free(self, slots: Int32) -> None:
-        self._free, self._num_free = np.empty(self.capacity, np.int32), len(slots)
-        self._free[: len(slots)] = slots
 
     @property
     def contents(self) -> Iterator[Float32]:
@@ -188,9 +178,7 @@ class PagePool(Stateful):
         epochs = self.epochs[self.live]
         if epochs.min(initial=0) < 0 or epochs.max(initial=0) > len(self.corrections):
             raise ValueError("pages of epochs that there are not")
-        empty = np.flatnonzero(self.counts == 0)
-        if not np.array_equal(np.sort(self.free), empty):
-            raise ValueError("free pages that are not free")
+        self.regions.check(self.counts > 0)
         size, taken = len(self._keys), int(np.count_nonzero(self._keys >= 0))
         if size < FEWEST_CELLS or size & (size - 1) or self._tails.shape != (size,) or self._room != size // 2 - taken:
             raise ValueError("a table of cells of another size")
@@ -289,14 +277,18 @@ class PagePool(Stateful):
         done, total = 0, rows.shape[1]
         numbers = np.empty(total, np.int32)
         while done < total:
-            if self._num_free == 0:
-                self._grow(self._next_capacity())
             if self._room == 0:
                 self._rehash()
-            done, self._num_free, self._room = kernels.deposit(
-                done, rows, _PER_CELL, self._free, self._num_free, self._room, self.counts, self.boxes, self.shelves,
-                self.cells, self.probation, self._keys, self._tails, self.pool, numbers,
+            regions = self.regions
+            done, self._room = kernels.deposit(
+                done, rows, _PER_CELL, self._room, self.counts, self.boxes, self.shelves, self.cells, self.probation,
+                self._keys, self._tails, regions.used, regions.owners, regions.following, regions.keys, regions.heads,
+                regions.free, regions.left, self.pool, numbers,
             )  # fmt: skip
+            if done < total and regions.left[1] == 0:
+                regions.make_room()
+            elif done < total and self._room > 0:
+                self._grow(self._next_capacity())
         self.total += total
         if total:
             touched = np.unique(numbers // PAGE)
@@ -357,8 +349,7 @@ class PagePool(Stateful):
         rows = self.rows_in(slots)
         self.counts[slots] = self.dirty[slots] = self.thinned[slots] = 0
         self.cells[slots] = -1
-        self._free[self._num_free : self._num_free + len(slots)] = slots
-        self._num_free += len(slots)
+        self.regions.release(slots)
         self.total -= rows.shape[1]
         self.add(rows)
 
@@ -463,17 +454,14 @@ class PagePool(Stateful):
                 f"map: expected at most {MOST_PAGES:,} pages of {PAGE} surfels, got {capacity:,}; take every second "
                 "frame or pixel, or map a part of the recording at a time"
             )
-        before = self.capacity
+        capacity = -(-capacity // SHELF) * SHELF
         for name, values in _columns(capacity).items():
             old = getattr(self, name)
             values[: len(old)] = old
             setattr(self, name, values)
         self.pool = self._backing.grow(self.pool, capacity * SPAN)
         self._residence.grow(len(self.shelves))
-        # Called when all pages are taken: the lowest of the new ones come first, so that shelves are filled in turn.
-        self._free = np.empty(capacity, np.int32)
-        self._free[: capacity - before] = np.arange(before, capacity)[::-1]
-        self._num_free = capacity - before
+        self.regions.grow(len(self.shelves))
 
     def _rehash(self, more: int = 0) -> None:
         """Make the table larger, with room for `more` cells, and leave out the cells that have no page to fill."""
