@@ -4,7 +4,7 @@ Every sequence is looked at as it is, and with each fault that can be made in me
 and for each figure that is judged its range over sound sequences, its limit, and its range over those with the fault.
 
     python benchmarks/checkup.py SEQUENCE...     recorded or rendered, with ground truth for all of the faults
-    python benchmarks/checkup.py --scenes        every scene, path and noise, 160x120, as they are
+    python benchmarks/checkup.py --scenes        every scene, path and noise, 320x240, as they are
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ def _cases(paths: list[str], scenes: bool, least: int) -> Iterator[tuple[str, st
             yield sequence.name, fault, spoiled
     for name, path in PATHS.items() if scenes else ():
         for noise in NOISE_MODELS:
-            config = sw.RenderConfig(scene=path.scene, path=name, noise=noise, width=160, height=120)
+            config = sw.RenderConfig(scene=path.scene, path=name, noise=noise, width=320, height=240, frames=240)
             rendered = sw.SyntheticSequence(config)
             yield rendered.name, "", rendered
 

@@ -24,11 +24,14 @@ _FAR = np.float32(1e6)
 _MOST_POINTS = 3000  # of a frame
 _LEAST_POINTS = 600  # of all frames: fewer tell nothing
 
+LEAST_WIDTH = 300
+"""Pixels: in a smaller image what a stereo camera loses beside edges is too large a part of it."""
+
 ZOOMS = (0.80, 0.85, 0.90, 0.95, 1.0, 1.05, 1.1, 1.15, 1.2, 1.25)
 MOST_SHIFT = 0.06
 """Zooms and the largest shift that are tried, the latter as a share of the width."""
 
-LEAST_MISPLACED = 0.02
+LEAST_MISPLACED = 0.025
 """Root mean square shift of the pixels that is told of, as a share of the width."""
 
 LEAST_GAIN = 3.0
@@ -86,7 +89,7 @@ def check_brims(brims: list[Brim]) -> Judgement:
     """Say whether colour is registered to depth, and of the same moment."""
     names = ("color_misplaced", "color_misplaced_sigmas", "color_lag_frames", "color_lag_sigmas")
     num_points = sum(len(brim.points) for brim in brims)
-    if num_points < _LEAST_POINTS:
+    if num_points < _LEAST_POINTS or next(iter(brims[0].edges.values())).shape[1] < LEAST_WIDTH:
         return [], dict.fromkeys(names)
     surfaces = {zoom: np.sum([_shifted_scores(brim, zoom) for brim in brims], axis=0) / num_points for zoom in ZOOMS}
     reach = surfaces[1.0].shape[0] // 2
