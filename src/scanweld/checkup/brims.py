@@ -31,7 +31,7 @@ ZOOMS = (0.80, 0.85, 0.90, 0.95, 1.0, 1.05, 1.1, 1.15, 1.2, 1.25)
 MOST_SHIFT = 0.06
 """Zooms and the largest shift that are tried, the latter as a share of the width."""
 
-LEAST_MISPLACED = 0.025
+LEAST_MISPLACED = 0.03
 """Root mean square shift of the pixels that is told of, as a share of the width."""
 
 LEAST_GAIN = 3.0
