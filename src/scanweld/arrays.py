@@ -155,9 +155,10 @@ def as_transforms(transforms: npt.ArrayLike, name: str = "T") -> Float64:
     last = np.eye(d + 1)[-1]
     fail((np.abs(array[:, -1] - last) > 1e-9).any(axis=1), "the last row must be (0, .., 0, 1)")
     rotation = array[:, :d, :d]
-    defect = np.abs(np.swapaxes(rotation, 1, 2) @ rotation - np.eye(d)).max(axis=(1, 2), initial=0.0)
-    determinant = np.linalg.det(rotation)
-    bad = (defect > ROTATION_TOLERANCE) | (determinant < 0)
+    with np.errstate(all="ignore"):  # an absurd entry is refused below
+        defect = np.abs(np.swapaxes(rotation, 1, 2) @ rotation - np.eye(d)).max(axis=(1, 2), initial=0.0)
+        determinant = np.linalg.det(rotation)
+    bad = ~((defect <= ROTATION_TOLERANCE) & (determinant >= 0))
     if bad.any():
         k = int(np.argmax(bad))
         size = f"|R^T R - I| = {defect[k]:.2g}, det = {determinant[k]:.3g}"

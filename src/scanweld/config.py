@@ -62,7 +62,8 @@ def _build(kind: type[T], values: Mapping[str, Any], where: str, prefix: str, al
     arguments: dict[str, Any] = {}
     for key, value in values.items():
         if key not in known:
-            raise ConfigError(f"{where}: unknown key '{prefix}{key}'; {_advice(key, known, prefix, all_keys())}")
+            shown = str(key)[:LONGEST_KEY]  # what is no key at all can be of any length
+            raise ConfigError(f"{where}: unknown key '{prefix}{shown}'; {_advice(shown, known, prefix, all_keys())}")
         hint = hints[key]
         if dataclasses.is_dataclass(hint):
             if not isinstance(value, Mapping):
@@ -84,6 +85,9 @@ def _all_keys(kind: Any, prefix: str) -> Iterator[str]:
         if dataclasses.is_dataclass(hints[item.name]):
             yield from _all_keys(hints[item.name], f"{prefix}{item.name}.")
 
+
+LONGEST_KEY = 80
+"""So many characters of an unknown key are shown, and compared."""
 
 SAME_KEY, SAME_KEY_HERE = 0.75, 0.5
 """A key may be meant that is at least so much like the given one: anywhere, and in the section where that was."""
@@ -112,6 +116,8 @@ def _checked(value: Any, hint: Any, where: str) -> Any:
         return value
     if not isinstance(value, allowed) or (isinstance(value, bool) and hint is not bool):
         raise ConfigError(f"{where}: expected {hint.__name__}, got {value!r}")
+    if isinstance(value, int) and abs(value) >= 1 << 63:
+        raise ConfigError(f"{where}: an integer beyond 64 bits")
     return hint(value)
 
 

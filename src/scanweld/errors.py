@@ -9,7 +9,8 @@
     ├── OutputError                             an output cannot be written, or would overwrite something
     └── MissingDependencyError (also an ImportError)   an optional extra is not installed
 
-A message says what, what was got, what was expected, and what to do. Data that allows no answer is no
+A message says what, what was got, what was expected, and what to do, in one line of printable characters whatever the
+file at fault holds. Data that allows no answer is no
 exception: see :class:`scanweld.registration.result.Status`.
 """
 
@@ -27,8 +28,18 @@ __all__ = [
 ]
 
 
+LONGEST_MESSAGE = 2000
+"""What is longer repeats what a file holds."""
+
+
 class ScanweldError(Exception):
     """Base of every error raised on purpose; the command line prints it in one line and exits with 1."""
+
+    def __str__(self) -> str:
+        text = super().__str__()
+        text = text if len(text) <= LONGEST_MESSAGE else f"{text[:LONGEST_MESSAGE]}.."
+        # A file may hold line ends, and codes that a terminal obeys.
+        return text if text.isprintable() else "".join(c if c.isprintable() else "\ufffd" for c in text)
 
 
 class InvalidInputError(ScanweldError, ValueError):

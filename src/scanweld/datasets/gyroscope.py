@@ -23,6 +23,9 @@ from scanweld.errors import DatasetError, InvalidInputError
 from scanweld.geometry import se3
 
 _TOLERANCE = 1e-3  # of a rotation that was printed with few digits
+_FASTEST_RAD_S = 1e4  # no camera turns so fast, and raw units of a sensor do
+_MAX_BYTES = 1 << 28  # of a text: two hours at 400 samples a second
+_ABSURD = 1e15  # seconds in any unit; differences of larger ones say nothing
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,14 +54,19 @@ class Gyroscope:
             raise InvalidInputError(
                 f"gyroscope: expected two or more timestamps (N,) and rates (N, 3), got {times.shape} and {rates.shape}"
             )
-        if not (np.isfinite(times).all() and np.isfinite(rates).all()):
-            raise InvalidInputError("gyroscope: a timestamp or rate is not finite")
+        if not (np.abs(times) < _ABSURD).all():
+            raise InvalidInputError("gyroscope: a timestamp is not finite, or absurd")
+        if not (np.abs(rates) < _FASTEST_RAD_S).all():
+            raise InvalidInputError(
+                f"gyroscope: a rate is not finite, or above {_FASTEST_RAD_S:g} rad/s; another unit?"
+            )
         if (np.diff(times) <= 0).any():
             at = int(np.argmax(np.diff(times) <= 0)) + 1
             raise InvalidInputError(
                 f"gyroscope: time must increase, sample {at} has {times[at]:.6f} s after {times[at - 1]:.6f} s"
             )
-        if R.shape != (3, 3) or not np.allclose(R @ R.T, np.eye(3), atol=_TOLERANCE) or np.linalg.det(R) < 0:
+        is_near = R.shape == (3, 3) and bool((np.abs(R) < 2).all())  # no larger numbers are multiplied
+        if not is_near or not np.allclose(R @ R.T, np.eye(3), atol=_TOLERANCE) or np.linalg.det(R) < 0:
             raise InvalidInputError("gyroscope: R_camera_imu is no rotation (3, 3)")
         for name, value in (("timestamps_s", times), ("rates_rad_s", rates), ("R_camera_imu", R)):
             value.flags.writeable = False
@@ -110,13 +118,23 @@ def read_gyroscope(folder: Path) -> Gyroscope | None:
     if not path.is_file():
         return None
     try:
-        rows = np.loadtxt(path, dtype=np.float64, comments="#", ndmin=2)
+        rows = _table(path)
         if rows.shape[1] < 4:
             raise ValueError(f"{rows.shape[1]} columns")
-        R = np.loadtxt(axes, dtype=np.float64).reshape(3, 3) if axes.is_file() else np.eye(3)
+        R = _table(axes).reshape(3, 3) if axes.is_file() else np.eye(3)
         return Gyroscope(rows[:, 0], rows[:, 1:4], R)
     except (OSError, ValueError) as fault:  # InvalidInputError is a ValueError
         raise DatasetError(
             f"{path}: expected lines `timestamp wx wy wz [ax ay az]` of increasing time, and a rotation in "
             f"{axes.name} if it is there: {fault}; remove the file to do without"
         ) from fault
+
+
+def _table(path: Path) -> Float64:
+    """Return the rows of numbers of a text file; raises ValueError where it holds anything else, or nothing."""
+    if path.stat().st_size > _MAX_BYTES:
+        raise ValueError(f"larger than {_MAX_BYTES >> 20} MiB")
+    lines = [line for line in path.read_text(encoding="utf-8").splitlines() if line.partition("#")[0].strip()]
+    if not lines:
+        raise ValueError("empty")
+    return np.loadtxt(lines, dtype=np.float64, comments="#", ndmin=2)

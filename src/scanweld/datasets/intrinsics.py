@@ -27,6 +27,7 @@ PLAUSIBLE_FOCAL = (0.2, 5.0)
 """Focal length of a depth camera as a multiple of the image width: 136 to 11 degrees across."""
 
 
+_LARGEST = 1e300  # integers of JSON have any size
 _ABSURD_FOCAL = (1e-3, 1e7)  # no camera in pixels; computing with it overflows
 
 
@@ -202,7 +203,7 @@ def read_text(path: Path) -> str:
 def require_number(path: Path | str, values: Mapping[str, Any], key: str) -> float:
     """Return a finite number of a JSON object; raises DatasetError when it is missing or something else."""
     value = values.get(key)
-    if not isinstance(value, (int, float)) or isinstance(value, bool) or not math.isfinite(value):
+    if not isinstance(value, (int, float)) or isinstance(value, bool) or not abs(value) <= _LARGEST:
         raise DatasetError(f"{path}: '{key}' must be a number, got {value!r}")
     return float(value)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -117,7 +116,7 @@ def known_poses(times_s: Float64, matrices: Float64, where: Path | str) -> Traje
         return None
     poses = matrices[finite].astype(np.float64)
     rotations = poses[:, :3, :3]
-    with np.errstate(over="ignore", invalid="ignore"):  # absurd entries are refused below
+    with np.errstate(all="ignore"):  # absurd entries are refused below
         defect = np.abs(np.swapaxes(rotations, 1, 2) @ rotations - np.eye(3)).max(axis=(1, 2))
         upright = np.linalg.det(rotations) > 0
     last_row = np.abs(poses[:, 3] - [0, 0, 0, 1]).max(axis=1)
@@ -139,7 +138,7 @@ def require_rate(rate_hz: object, where: Path | str) -> float:
     DatasetError
         When it is not.
     """
-    if isinstance(rate_hz, (int, float)) and not isinstance(rate_hz, bool) and math.isfinite(rate_hz) and rate_hz > 0:
+    if isinstance(rate_hz, (int, float)) and not isinstance(rate_hz, bool) and 0 < rate_hz < 1e300:
         return float(rate_hz)
     raise DatasetError(f"{where}: expected a positive number of frames a second, got {rate_hz!r}")
 

@@ -216,12 +216,13 @@ def _pinhole(matrix: Float64) -> Intrinsics:
 def _color_from_depth(file: Path, header: _Header) -> Float64:
     """T_color_depth; a matrix of zeros, which some recorders write, stands for the identity."""
     known = [np.eye(4) if not matrix.any() else matrix for matrix in (header.color_extrinsics, header.depth_extrinsics)]
-    try:
-        T = np.linalg.inv(known[0]) @ known[1]
-    except np.linalg.LinAlgError:
-        T = np.full((4, 4), np.nan)
-    rotation = T[:3, :3]
-    if not np.isfinite(T).all() or np.abs(rotation.T @ rotation - np.eye(3)).max() > 1e-2:
+    with np.errstate(all="ignore"):  # absurd entries are refused below
+        try:
+            T = np.linalg.inv(known[0]) @ known[1]
+        except np.linalg.LinAlgError:
+            T = np.full((4, 4), np.nan)
+        defect = np.abs(T[:3, :3].T @ T[:3, :3] - np.eye(3)).max()
+    if not np.isfinite(T).all() or not defect <= 1e-2:
         raise DatasetError(f"{file}: the extrinsics of colour and depth are no rigid transforms; the file is damaged")
     return np.asarray(T, dtype=np.float64)
 

@@ -268,16 +268,16 @@ def _rigid(path: Path, lines: list[int], matrices: Float64) -> Float64:
     poses = np.tile(np.eye(4), (len(matrices), 1, 1))
     poses[:, : matrices.shape[1]] = matrices
     rotations = poses[:, :3, :3]
-    with np.errstate(over="ignore", invalid="ignore"):  # absurd entries are refused below
+    with np.errstate(all="ignore"):  # absurd entries are refused below
         defect = np.abs(np.swapaxes(rotations, 1, 2) @ rotations - np.eye(3)).max(axis=(1, 2))
-        mirrored = ~(np.linalg.det(rotations) > 0)
+        determinant = np.linalg.det(rotations)
     last_row = np.abs(poses[:, 3] - [0, 0, 0, 1]).max(axis=1)
-    wrong = ~(defect <= POSE_TOLERANCE) | mirrored | (last_row > POSE_TOLERANCE)
+    wrong = ~(defect <= POSE_TOLERANCE) | ~(determinant > 0) | (last_row > POSE_TOLERANCE)
     if wrong.any():
         at = int(np.argmax(wrong))
         raise FileFormatError(
             f"{path}, line {lines[at]}: not a rigid pose (|R^T R - I| = {defect[at]:.2g}, "
-            f"det R = {np.linalg.det(rotations[at]):.3g}); remove it, or divide a scale out"
+            f"det R = {determinant[at]:.3g}); remove it, or divide a scale out"
         )
     u, _, vt = np.linalg.svd(rotations)
     poses[:, :3, :3] = u @ vt

@@ -215,9 +215,9 @@ def _tiles(run: RunFiles) -> str:
     tracked, total = int(run.frames.posed.sum()), len(run.frames)
     dropped = run.frames.state.count("dropped")
     tiles = [("frames tracked", f"{tracked:,}", f"of {total:,}" + (f", {dropped:,} dropped" if dropped else ""))]
-    if m.get("ate_rmse_m") is not None:
+    if {"ate_rmse_m", "ate_max_m"} <= m.keys():
         tiles.append(("error of the path (ATE)", length(m["ate_rmse_m"]), f"at most {length(m['ate_max_m'])}"))
-    if m.get("rpe_trans_m") is not None:
+    if {"rpe_trans_m", "rpe_rot_deg"} <= m.keys():
         tiles.append(("error a frame (RPE)", length(m["rpe_trans_m"]), f"{m['rpe_rot_deg']:.3g}°"))
     lost = run.frames.state.count("lost")
     found = run.frames.state.count("relocalised")

@@ -143,12 +143,15 @@ def read_run_files(folder: Path, *, truth: Path | None = None) -> RunFiles:
     config_path = folder / "config.toml"
     config_text = config_path.read_text(encoding="utf-8", errors="replace") if config_path.is_file() else ""
     keyframes, loops = read_keyframes(folder / KEYFRAMES_FILE)
+    surfels = read_ply_columns(folder / "map.ply")
+    if not {"x", "y", "z"} <= surfels.keys():
+        raise FileFormatError(f"{folder / 'map.ply'}: the points have no x, y and z, only {', '.join(surfels)}")
     return RunFiles(
         name=str(run.get("name") or Path(str(run.get("input") or "")).name or folder.resolve().name),
         frames=frames,
         trajectory=read_trajectory(folder / "trajectory.txt", "tum"),
         truth=read_trajectory(true_path) if truth or true_path.is_file() else None,
-        surfels=read_ply_columns(folder / "map.ply"),
+        surfels=surfels,
         metrics=_numbers(read_json(folder / "metrics.json")),
         run=run,
         config_text=config_text,
