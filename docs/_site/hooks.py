@@ -19,13 +19,14 @@ ELSEWHERE = {
     "README.md": "introduction.md",
     "CHANGELOG.md": "changelog.md",
     "CONTRIBUTING.md": "contributing.md",
+    "SECURITY.md": "security.md",
     "examples": "gallery.md",
     "examples/README.md": "gallery.md",
     "docs/decisions": "decisions/index.md",
 }
 """Files and folders of the repository, and the pages of the site that stand for them."""
 
-COPIED = ("introduction.md", "changelog.md", "contributing.md")
+COPIED = ("introduction.md", "changelog.md", "contributing.md", "security.md")
 """Pages whose links start at the root of the repository."""
 
 
@@ -48,6 +49,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
         "decisions/index.md": decisions_page(REPOSITORY / "docs/decisions"),
         "changelog.md": (REPOSITORY / "CHANGELOG.md").read_text(encoding="utf-8"),
         "contributing.md": (REPOSITORY / "CONTRIBUTING.md").read_text(encoding="utf-8"),
+        "security.md": (REPOSITORY / "SECURITY.md").read_text(encoding="utf-8"),
     } | {path: text for path, (_, text) in reference_pages().items()}
     for path, text in pages.items():
         files.append(File.generated(config, path, content=text))
