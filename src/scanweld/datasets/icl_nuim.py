@@ -110,6 +110,10 @@ def _open_original(folder: Path, depth: dict[int, Path], overrides: Overrides) -
         ground_truth=truth,
         depth_reader=read_ray_distance_text,
     )
+    # An image can claim any size; a number of a text takes two bytes at least.
+    num_pixels, most = sequence.camera.width * sequence.camera.height, max(f.depth.stat().st_size for f in frames)
+    if num_pixels > (most + 1) // 2:
+        raise DatasetError(f"{folder}: images of {num_pixels} pixels, but no .depth file is longer than {most} bytes")
     return FileSequence(
         name=sequence.name,
         camera=sequence.camera,
@@ -177,6 +181,6 @@ def _vector(path: Path, text: str, key: str) -> Float64:
         vector = np.array([float(word) for word in match[1].replace(",", " ").split()]) if match else np.empty(0)
     except ValueError:
         vector = np.empty(0)
-    if vector.shape != (3,) or not np.isfinite(vector).all():
+    if vector.shape != (3,) or not (np.abs(vector) < 1e50).all():  # products of larger ones are infinite
         raise DatasetError(f"{path}: expected a line `{key} = [x, y, z]';`")
     return vector

@@ -18,6 +18,7 @@ from scanweld.errors import DatasetError, UnreadableFrameError
 
 _KEPT = 8
 _MIN_BYTES_PER_FRAME = 16
+_SILENT = 0  # what OpenCV calls LOG_LEVEL_SILENT
 
 _opening = threading.Lock()
 
@@ -151,9 +152,10 @@ def _quiet() -> Iterator[None]:
     import cv2
 
     with _opening:
-        level = cv2.utils.logging.getLogLevel()
-        cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+        log = getattr(cv2.utils, "logging", cv2)  # where OpenCV 5 has them, and 4
+        level = log.getLogLevel()
+        log.setLogLevel(_SILENT)
         try:
             yield
         finally:
-            cv2.utils.logging.setLogLevel(level)
+            log.setLogLevel(level)

@@ -30,6 +30,7 @@ POSED_STATES = ("tracking", "relocalised")
 """States of frames whose pose was measured."""
 
 _STAGE_PREFIX = "ms_"
+_LARGEST_NUMBER = 1e9
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -188,9 +189,15 @@ def read_frames(path: Path) -> FrameTable:
             raise FileFormatError(f"{path}: column '{name}' has a value that is not finite")
         return values
 
+    def integers(name: str) -> Int64:
+        values = numbers(name)
+        if (np.abs(values) > _LARGEST_NUMBER).any():
+            raise FileFormatError(f"{path}: column '{name}' has a value that is no number of frames")
+        return values.astype(np.int64)
+
     stages = [key for key in (rows[0] if rows else ()) if key and key.startswith(_STAGE_PREFIX)]
     return FrameTable(
-        number=numbers("frame").astype(np.int64),
+        number=integers("frame"),
         timestamp_s=numbers("timestamp"),
         state=words("status"),
         alignment=words("alignment"),
@@ -200,7 +207,7 @@ def read_frames(path: Path) -> FrameTable:
         overlap=numbers("overlap"),
         surfels=numbers("surfels"),
         stage_ms={stage.removeprefix(_STAGE_PREFIX): numbers(stage) for stage in stages},
-        submap=numbers("submap").astype(np.int64),
+        submap=integers("submap"),
     )
 
 
@@ -212,9 +219,9 @@ def read_keyframes(path: Path) -> tuple[Int64, Int64]:
         with path.open(newline="", encoding="utf-8") as file:
             rows = [(int(row["frame"]), row.get("loop") or "") for row in csv.DictReader(file)]
         loops = [(frame, int(other)) for frame, others in rows for other in others.split()]
-    except (OSError, UnicodeDecodeError, csv.Error, KeyError, ValueError, TypeError) as error:
+        return np.array([frame for frame, _ in rows], np.int64), np.array(loops, np.int64).reshape(-1, 2)
+    except (OSError, UnicodeDecodeError, csv.Error, KeyError, ValueError, TypeError, OverflowError) as error:
         raise FileFormatError(f"{path}: not a list of keyframes: {error}") from None
-    return np.array([frame for frame, _ in rows], np.int64), np.array(loops, np.int64).reshape(-1, 2)
 
 
 def read_json(path: Path) -> Mapping[str, Any]:
