@@ -463,3 +463,10 @@ def test_no_file_stays_open(tmp_path: Path) -> None:
         pytest.skip("open files are listed on Linux only")
     links = [os.readlink(entry) for entry in descriptors.iterdir() if entry.exists()]
     assert [link for link in links if link.startswith(str(tmp_path))] == []
+
+
+@pytest.mark.parametrize("compression", [zipfile.ZIP_LZMA, zipfile.ZIP_BZIP2])
+def test_record3d_compressed_by_what_takes_any_memory(tmp_path: Path, compression: int) -> None:
+    """The head of LZMA says how large its dictionary is, up to 4 GiB; recordings are stored or deflated."""
+    path = write_record3d(tmp_path / "a.r3d", record3d_files(compress=False), compression)
+    fails(path, "neither stored nor deflated")

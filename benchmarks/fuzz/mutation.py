@@ -30,6 +30,10 @@ FLOATS = (0.0, -0.0, 1.0, -1.0, float("nan"), float("inf"), float("-inf"), 1e38,
 _NUMBER = re.compile(rb"[-+]?\d+(\.\d*)?([eE][-+]?\d+)?")
 _WORD = re.compile(rb"[^\s,;:=\[\]{}\"']+")
 _LONGEST = 1 << 20
+_SPOILT_BEFORE = (
+    ValueError, IndexError, struct.error, zlib.error, zipfile.BadZipFile, NotImplementedError, EOFError, Warning,
+)  # fmt: skip
+"""What taking an input apart raises that is not whole any more."""
 
 
 def mutate(files: Files, others: Sequence[Files], random: Random) -> dict[str, bytes]:
@@ -52,8 +56,8 @@ def spoil(content: bytes, others: Sequence[bytes], random: Random) -> bytes:
     if repack is not None and random.random() < 0.7:
         try:
             return repack(content, random)
-        except (ValueError, IndexError, struct.error, zlib.error, zipfile.BadZipFile, NotImplementedError, EOFError):
-            pass  # it was spoilt before
+        except _SPOILT_BEFORE:
+            pass
     if _is_text(content) and random.random() < 0.85:
         return random.choice(_TEXTUAL)(content, random)
     if others and random.random() < 0.1:

@@ -138,6 +138,8 @@ class _Archive:
             raise UnreadableFrameError(f"{self.path}: has no {name}")
         if entry.file_size > max_bytes:
             raise UnreadableFrameError(f"{self.path}: {name} claims {entry.file_size} bytes, at most {max_bytes} fit")
+        if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):  # LZMA takes what memory it claims
+            raise UnreadableFrameError(f"{self.path}: {name} is neither stored nor deflated")
         try:
             return self._zip.read(entry)
         except _ZIP_FAULTS as error:
