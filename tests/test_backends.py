@@ -192,12 +192,13 @@ def short_run(frames: int, noise: str = "none") -> sw.Slam:
     return slam
 
 
-@pytest.mark.parametrize(("noise", "within_m"), [("none", 1e-5), ("kinect", 1e-4)])
+@pytest.mark.parametrize(("noise", "within_m"), [("none", 1e-5), ("kinect", 3e-4)])
 def test_a_run(noise: str, within_m: float) -> None:
     """Eight frames of a room. Without noise, rounding alone parts the two: some micrometres.
 
     With noise there are points at the edge of a gate. Where one is matched by one of the two only, the path to the
-    minimum is another, and it ends wherever a step is below 0.1 mm (`step_m`).
+    minimum is another, and it ends where what is left is a quarter of the pose's standard deviation, which is about
+    1 mm at this size. Measured 0.14 mm.
     """
     runs = []
     for name in BACKENDS:

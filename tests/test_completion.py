@@ -45,7 +45,7 @@ def test_every_shell_has_a_script(shell: str) -> None:
 
 
 def test_a_command_is_completed() -> None:
-    assert set(completed("scanweld re")) == {"register", "render", "report"}
+    assert set(completed("scanweld re")) == {"register", "render", "repeat", "report"}
 
 
 def test_options_and_their_values_are_completed() -> None:

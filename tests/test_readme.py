@@ -52,7 +52,7 @@ def test_commands_and_programs_run(
                 assert run(shlex.split(f"{command} {SMALL.get(command, '')}")[1:]) == 0, command
                 commands += 1
     printed = capsys.readouterr().out
-    assert commands == 8
+    assert commands == 9
     assert "6 of 6 tracked" in printed
 
     # The clouds were aligned, and both ways of running SLAM gave a map.

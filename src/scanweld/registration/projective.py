@@ -311,7 +311,7 @@ def _descend(
             # need only hand over a start within its pixel size.
             deviation = standard_deviation(step.equations, end.parts) if level == 0 else 0.0
             left, before = motion * min(max(motion / before, CONTRACTION), 1.0), motion
-            if left < max(config.step_m * 4**level, 0.5 * deviation):
+            if left < max(config.step_m * 4**level, 0.25 * deviation):
                 end.converged = True
                 break
     return end
