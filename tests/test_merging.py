@@ -10,7 +10,7 @@ from scanweld.evaluation.doubled_surfaces import doubled_surfaces
 from scanweld.geometry.views import MapCorrection
 from scanweld.mapping.fusion import FusionConfig
 from scanweld.mapping.mapper import SurfelMapper
-from scanweld.mapping.merging import MergingConfig, merge_doubled
+from scanweld.mapping.merging import MergingConfig, merge_doubled, thin_crowded
 from scanweld.mapping.surfel_map import SurfelMap
 
 SPACING = 0.01
@@ -201,3 +201,53 @@ def test_a_correction_of_the_map_fuses_what_it_brings_together() -> None:
     mapper.finish()
     assert len(mapper.map) < 1.05 * 60 * 60
     assert np.median(mapper.map.positions_m[2]) == pytest.approx(0.005, abs=1e-3)
+
+
+class TestThinCrowded:
+    @staticmethod
+    def crowded() -> SurfelMap:
+        """Three walls at one place, ten metres from a single one; all are stable."""
+        surfels = SurfelMap()
+        for seed in range(3):
+            add(surfels, wall(seed=seed), anchor=0, radius=0.02)
+        add(surfels, wall() + np.array([[10.0], [0], [0]], np.float32), anchor=0)
+        surfels.clean(surfels.pages.live, 0, 40, 3.0)
+        return surfels
+
+    def test_what_shares_a_place_becomes_one_cell_by_cell(self) -> None:
+        surfels = self.crowded()
+        gone = [thin_crowded(surfels, 100.0) for _ in range(60)]
+        assert gone[0] > 0
+        assert gone[-10:] == [0] * 10
+        assert np.count_nonzero(surfels.positions_m[0] > 5) == 60 * 60
+        rest = surfels.positions_m[:, surfels.positions_m[0] < 5]
+        distance, _ = cKDTree(rest.T).query(rest.T, k=2)
+        assert np.quantile(distance[:, 1], 0.02) > 0.009  # half of the radius; a page may keep a few that share a place
+        assert rest.shape[1] < 60 * 60
+
+    def test_a_wall_that_is_seen_again_and_again_does_not_grow(self) -> None:
+        """Centres half a radius apart, 1 cm, leave room for 4157 at most on 60 x 60 cm (hexagons); pages may keep some."""
+        surfels, sizes = self.crowded(), []
+        for seed in range(3, 12):
+            add(surfels, wall(seed=seed), anchor=0)
+            surfels.clean(surfels.pages.live, 0, 40, 3.0)
+            for _ in range(60):
+                thin_crowded(surfels, 100.0)
+            sizes.append(int(np.count_nonzero(surfels.positions_m[0] < 5)))
+        assert sizes[-1] < 1.2 * 4157
+        assert sizes[-1] - sizes[-4] < 0.05 * 3 * 60 * 60
+
+    def test_what_is_not_stable_is_waited_for(self) -> None:
+        surfels = self.crowded()
+        for _ in range(60):
+            thin_crowded(surfels, 100.0)
+        add(surfels, wall(seed=9), anchor=0, confidence=1.0)
+        assert thin_crowded(surfels, 100.0) == 0
+
+    def test_pages_that_have_still_to_move_are_left_alone(self) -> None:
+        """After a correction no page is of any cell until it has moved: they must not be taken for one cell."""
+        surfels = self.crowded()
+        surfels.apply_correction(MapCorrection(np.array([0], np.int32), np.eye(4)[None]))
+        assert thin_crowded(surfels, 100.0) == 0
+        surfels.pages.follow(surfels.capacity)
+        assert thin_crowded(surfels, 100.0) > 0

@@ -78,7 +78,8 @@ def thin_crowded(surfels: SurfelMap, most: float) -> int:
     places. Only pages without anything unstable are looked at: most of what is new does not last anyway.
     """
     pages = surfels.pages
-    more = np.where(pages.probation == NEVER, pages.counts - pages.thinned, 0)
+    settled = (pages.probation == NEVER) & (pages.cells >= 0)  # a page that has still to move is of no cell
+    more = np.where(settled, pages.counts - pages.thinned, 0)
     slot = int(more.argmax())
     if more[slot] < _CROWDED:
         return 0
@@ -86,7 +87,6 @@ def thin_crowded(surfels: SurfelMap, most: float) -> int:
     _, gone = _merge_cell(pages, cell, 0, (_SAME_PLACE_M, _COSINE, most, _SAME_PLACE_SHARE))
     mine = pages.cells == cell
     pages.thinned[mine] = pages.counts[mine]
-    pages.thinned[slot] = pages.counts[slot]  # it may be that of no cell
     return gone
 
 
