@@ -226,7 +226,7 @@ class TestThinCrowded:
         assert rest.shape[1] < 60 * 60
 
     def test_a_wall_that_is_seen_again_and_again_does_not_grow(self) -> None:
-        """Centres half a radius apart, 1 cm, leave room for 4157 at most on 60 x 60 cm (hexagons); pages may keep some."""
+        """Centres half a radius apart, 1 cm, leave room for 4157 on 60 x 60 cm (hexagons); pages may keep some more."""
         surfels, sizes = self.crowded(), []
         for seed in range(3, 12):
             add(surfels, wall(seed=seed), anchor=0)
