@@ -70,11 +70,17 @@ class Walk:
 
 
 @pytest.fixture(scope="module")
-def apart() -> Walk:
+def walked() -> Walk:
     """Half of the room, a covered lens, a part of the other half: nothing in common yet."""
     config = sw.RenderConfig(width=CAMERA.width, height=CAMERA.height, noise="kinect")
     sequence = sw.SyntheticSequence(config, trajectory=built_in_path("sweep", 450, 30.0))
     return Walk(sw.build_slam(CAMERA), sequence).on([*FIRST, *[BLIND] * 4, *ELSEWHERE])
+
+
+@pytest.fixture
+def apart(walked: Walk) -> Walk:
+    """Return a walk of the test's own: whoever asks for the maps ends what is under way."""
+    return walked.copy()
 
 
 class TestApart:
