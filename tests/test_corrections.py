@@ -165,10 +165,10 @@ class TestMeetings:
         met.add(np.array([3]), np.zeros((4, 1)), np.array([[gap], [moved_m], [0], [0]]))
         assert met.among(5, 0.002).tolist() == []
 
-    def test_listed_until_something_comes_again(self) -> None:
+    def test_dealt_with_until_something_comes_again(self) -> None:
         met, ranges = Meetings(), np.array([[9.0], [0.01], [0], [0]])
         met.add(np.array([3]), np.zeros((4, 1)), ranges)
-        met.list(3)
+        met.dealt_with(3)
         assert met.among(5, 0.002).tolist() == []
         met.add(np.array([3]), ranges, ranges)
         assert met.among(5, 0.002).tolist() == [3]
@@ -176,6 +176,6 @@ class TestMeetings:
     def test_a_new_correction_keeps_what_waits(self) -> None:
         met, ranges = Meetings(), np.array([[9.0, 9.0], [0.01, 0.01], [0, 0], [0, 0]])
         met.add(np.array([3, 4]), np.zeros((4, 2)), ranges)
-        met.list(3)
+        met.dealt_with(3)
         met.begin()
         assert met.cells.tolist() == met.among(5, 0.002).tolist() == [4]

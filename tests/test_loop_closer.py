@@ -17,6 +17,7 @@ from scanweld.loop_closure.held_out import fits_better, fits_in_place
 from scanweld.loop_closure.keyframes import KeyframeConfig
 from scanweld.loop_closure.loop_closer import KeyframeLoopCloser, LoopClosingConfig
 from scanweld.loop_closure.place_recognition import PlaceConfig
+from scanweld.loop_closure.search import Edge, Found
 from scanweld.parallel import limited_threads
 from scanweld.trajectory import FrameResult, FrameState
 
@@ -119,6 +120,25 @@ class TestLag:
         np.testing.assert_allclose(
             se3.inverse(after[known - 1]) @ after[known:], se3.inverse(before[known - 1]) @ before[known:], atol=1e-12
         )
+
+    def test_keyframes_since_move_with_the_one_that_they_came_after(self) -> None:
+        """Back at the first of four keyframes the camera turns elsewhere: what is new there moves with the first."""
+        frames, true = sequence()
+        closer = KeyframeLoopCloser(DENSE)
+        feed(closer, frames[:4], true[:4])
+        assert len(closer.database) == 4
+        closer._current[0] = 0
+        sighting = closer.database.sight(sw.build_pyramid(frames[5]))
+        for k, keyframe in ((5, 0), (6, 4)):
+            closer._add(sighting, true[k], k)
+            assert (closer._edges[-1].i, closer._edges[-1].j) == (keyframe, closer.keyframe)
+        old = np.stack([keyframe.T_world_camera for keyframe in closer.database.keyframes])
+        T = np.stack([se3.exp([0.01 * (k + 1), 0, 0, 0, 0.01 * k, 0]) for k in range(4)])
+        loop = Edge(0, 3, np.eye(4), np.eye(6), True)
+        found = closer._close(Found(loop, T @ old[:4], ()), np.arange(4))
+        np.testing.assert_allclose(found.T_new_old, T[[0, 1, 2, 3, 0, 0]], atol=1e-12)
+        new = np.stack([keyframe.T_world_camera for keyframe in closer.database.keyframes])
+        np.testing.assert_allclose(new, found.T_new_old @ old, atol=1e-12)
 
     def test_what_is_under_way_can_be_had_at_once_and_copied(self) -> None:
         frames, true = sequence()

@@ -208,7 +208,10 @@ class KeyframeLoopCloser(Stateful):
         """Check that submaps and edges are of keyframes that there are."""
         count = len(self.database)
         named = [*self._current.values(), *(k for edge in self._edges for k in (edge.i, edge.j))]
-        if self._submaps.shape != (count,) or not all(0 <= index < count for index in named):
+        queries = [*self._queries, *([] if self._sought is None else [self._sought])]
+        named += [k for query in queries for k in (query.keyframe, *query.revisited, *query.elsewhere)]
+        sought = self._sought is None or self._sought.keyframe < self._known <= count
+        if not sought or self._submaps.shape != (count,) or not all(0 <= index < count for index in named):
             raise ValueError("submaps or edges of keyframes that are not there")
 
     def _in_submap(self, submap: int | None = None) -> Bool:
@@ -307,13 +310,18 @@ class KeyframeLoopCloser(Stateful):
         return None
 
     def _close(self, found: Found, then: Int64) -> MapCorrection:
-        """Move the keyframes of the submap: those of `then` as found, later ones with the last of these."""
+        """Move the keyframes of the submap: those of `then` as found, later ones with the one that they came after."""
         assert found.loop is not None
         self._edges.append(found.loop)
         poses, members = [keyframe.T_world_camera for keyframe in self.database.keyframes], self._members()
         old = np.stack([poses[index] for index in members])
-        T_new_old = found.T_world_keyframe @ se3.inverse(old[: len(then)])
-        T_new_old = np.concatenate([T_new_old, np.repeat(T_new_old[-1:], len(members) - len(then), axis=0)])
+        T_new_old = np.concatenate([found.T_world_keyframe @ se3.inverse(old[: len(then)]), old[len(then) :]])
+        place, before = (
+            {int(index): k for k, index in enumerate(members)},
+            {e.j: e.i for e in self._edges if not e.loop},
+        )
+        for k in range(len(then), len(members)):
+            T_new_old[k] = T_new_old[place[before[int(members[k])]]]
         new = np.concatenate([found.T_world_keyframe, T_new_old[len(then) :] @ old[len(then) :]])
         for index, pose in zip(members, new, strict=True):
             poses[index] = pose

@@ -62,7 +62,7 @@ def merge_doubled(surfels: SurfelMap, most: float, config: MergingConfig | None 
     looked_at, gone = 0, 0
     while len(cells := meetings.among(config.gap, _MOVED_M)):
         for cell in cells.tolist():
-            meetings.list(cell)  # before: pages around it may follow only now, into this cell or another
+            meetings.dealt_with(cell)  # before: pages around it may follow only now, into this cell or another
             limits = (config.distance_m, _COSINE, most, 1.0)
             num, fewer = _merge_cell(surfels.pages, cell, config.gap, limits)
             looked_at, gone = looked_at + num, gone + fewer

@@ -76,7 +76,7 @@ class Meetings(Stateful):
     ----------
     cells : (C,) keys, ascending
     least, largest : (4, C) anchor and motion [m] of the surfels that moved
-    fresh : (C,) whether something came since the cell was last listed
+    fresh : (C,) whether something came since the cell was last dealt with
     """
 
     STATE: ClassVar = {"cells": Int64, "least": Float64, "largest": Float64, "fresh": Bool}
@@ -88,7 +88,7 @@ class Meetings(Stateful):
         self.fresh: Bool = np.empty(0, np.bool_)
 
     def begin(self) -> None:
-        """Forget the cells that have been listed: with a new correction they are looked at anew."""
+        """Forget the cells that were dealt with: with a new correction they are looked at anew."""
         self._keep(self.fresh)
 
     def add(self, cells: Int64, least: Float64, largest: Float64) -> None:
@@ -111,7 +111,7 @@ class Meetings(Stateful):
         self.fresh &= met  # it takes another page to make a difference to the others
         return self.cells[self.fresh]
 
-    def list(self, cell: int) -> None:
+    def dealt_with(self, cell: int) -> None:
         """Note that a cell was dealt with."""
         self.fresh[np.searchsorted(self.cells, cell)] = False
 

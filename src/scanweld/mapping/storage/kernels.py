@@ -258,7 +258,7 @@ def move_pages(start, stop, slots, epochs, tables, counts, pool, whole, least, l
             least[k, s], largest[k, s] = 1e9, -1e9
         for k in range(np.uint64(counts[slot])):
             anchor = whole[base + ANCHOR + k]
-            T = table[min(anchor, others)]
+            T = table[others if (anchor < 0) | (anchor > others) else anchor]
             x, y, z = np.float64(pool[base + k]), np.float64(pool[base + Y + k]), np.float64(pool[base + Z + k])
             pool[base + k] = T[0] * x + T[1] * y + T[2] * z + T[3]
             pool[base + Y + k] = T[4] * x + T[5] * y + T[6] * z + T[7]
