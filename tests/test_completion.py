@@ -58,7 +58,7 @@ def test_options_and_their_values_are_completed() -> None:
 def test_values_are_those_that_the_commands_take() -> None:
     """Formats begin with auto, settings are KEY=DEFAULT as `--set` takes them, each with a word on what it is."""
     from scanweld.cli.slam import load_config
-    from scanweld.slam.system import SlamConfig
+    from scanweld.slam.config import SlamConfig
 
     assert next(name for name, _ in formats("")) == "auto"
     assert scenes("twin") == ["twin-rooms"]

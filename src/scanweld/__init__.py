@@ -81,9 +81,10 @@ if TYPE_CHECKING:
     from scanweld.registration.uncertainty import point_covariances
     from scanweld.runs.mesh import mesh_run
     from scanweld.runs.run import RunSummary, run_sequence
+    from scanweld.slam.config import SlamConfig
     from scanweld.slam.health import HealthConfig
     from scanweld.slam.submaps import SubmapConfig
-    from scanweld.slam.system import Slam, SlamConfig, build_slam
+    from scanweld.slam.system import Slam, build_slam
     from scanweld.tracking.dynamics import DynamicsConfig
     from scanweld.tracking.tracker import FrameToModelTracker, TrackingConfig
     from scanweld.tracking.two_frames import TwoFrameConfig, align_frames
@@ -138,7 +139,8 @@ _HOME = {
     "registration.uncertainty": ("point_covariances",),
     "runs.run": ("RunSummary", "run_sequence"),
     "slam.health": ("HealthConfig",),
-    "slam.system": ("Slam", "SlamConfig", "build_slam"),
+    "slam.config": ("SlamConfig",),
+    "slam.system": ("Slam", "build_slam"),
     "tracking.dynamics": ("DynamicsConfig",),
     "tracking.tracker": ("FrameToModelTracker", "TrackingConfig"),
     "tracking.two_frames": ("TwoFrameConfig", "align_frames"),

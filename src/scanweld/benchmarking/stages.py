@@ -20,7 +20,8 @@ from scanweld.geometry.frame import Frame
 from scanweld.geometry.views import ModelView
 from scanweld.loop_closure.loop_closer import KeyframeLoopCloser
 from scanweld.mapping.mapper import SurfelMapper
-from scanweld.slam.system import SlamConfig, build_slam
+from scanweld.slam.config import SlamConfig
+from scanweld.slam.system import build_slam
 from scanweld.tracking.tracker import FrameToModelTracker
 
 STAGES = ("decode", "surfaces", "view", "track", "fuse", "loop", "other")

@@ -55,7 +55,7 @@ def noises(incomplete: str) -> list[str]:
 
 def slam_settings(incomplete: str) -> list[tuple[str, str]]:
     """Complete KEY=VALUE for `slam --set`: the key with its default, and what it means."""
-    from scanweld.slam.system import SlamConfig
+    from scanweld.slam.config import SlamConfig
 
     return [(f"{key}={value}", doc) for key, value, doc in _settings(SlamConfig()) if key.startswith(incomplete)]
 

@@ -29,7 +29,7 @@ def demo(
     from scanweld.datasets.open import open_sequence
     from scanweld.datasets.synthetic import RenderConfig, render_sequence
     from scanweld.runs.folder import check_writable
-    from scanweld.slam.system import SlamConfig
+    from scanweld.slam.config import SlamConfig
 
     force = force or out == Path("scanweld-demo")
     check_writable(out, force=force)

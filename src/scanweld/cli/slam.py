@@ -19,7 +19,7 @@ from scanweld.cli.view import HOST, PORT, opened_observers
 if TYPE_CHECKING:
     from scanweld.datasets.base import RgbdSequence
     from scanweld.runs.run import RunSummary
-    from scanweld.slam.system import SlamConfig
+    from scanweld.slam.config import SlamConfig
 
 Option = typer.Option
 
@@ -148,7 +148,7 @@ def collected_warnings() -> Iterator[list[str]]:
 def load_config(path: Path | None, overrides: list[str]) -> SlamConfig:
     """Return the configuration: defaults < file < `--set`."""
     from scanweld.config import from_mapping, load_toml, merge, parse_override
-    from scanweld.slam.system import SlamConfig
+    from scanweld.slam.config import SlamConfig
 
     values: dict[str, Any] = load_toml(path) if path else {}
     if path is not None:

@@ -27,7 +27,7 @@ from scanweld.report.settings import default_values, find_differences, marked_to
 from scanweld.report.stretches import KINDS, Stretch, find_stretches, kinds_of
 from scanweld.report.verdict import Verdict, judge, other_warnings
 from scanweld.report.words import count_of, length
-from scanweld.slam.system import SlamConfig
+from scanweld.slam.config import SlamConfig
 
 REPORT_FILE = "report.html"
 

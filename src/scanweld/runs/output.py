@@ -31,9 +31,10 @@ from scanweld.mapping.surfel_map import SurfelMap
 from scanweld.parallel import get_num_threads, processor
 from scanweld.report.page import write_report
 from scanweld.report.plots import plot_path, plot_tracking
+from scanweld.slam.config import SlamConfig
 from scanweld.slam.motion import trajectory_of
 from scanweld.slam.stages import LoopCloser
-from scanweld.slam.system import Slam, SlamConfig
+from scanweld.slam.system import Slam
 from scanweld.trajectory import FrameResult, Trajectory
 
 logger = logging.getLogger(__name__)

@@ -21,7 +21,7 @@ from scanweld.runs.comparison import Comparison, compare_runs, differences_of_fi
 from scanweld.runs.folder import MARK
 from scanweld.runs.reopen import given_poses, read_description, reopen_input
 from scanweld.runs.run import Progress, poses_by_frame, run_sequence
-from scanweld.slam.system import SlamConfig
+from scanweld.slam.config import SlamConfig
 
 INPUT = ("input", "format", "frames", "scale", "poses", "camera", "depth_scale", "topics", "render")
 """What run.json says of where the frames come from."""

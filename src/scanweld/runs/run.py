@@ -35,8 +35,9 @@ from scanweld.runs.observer import RunObserver
 from scanweld.runs.output import write_run
 from scanweld.runs.refining import calibrate as calibrate_camera
 from scanweld.runs.refining import described
+from scanweld.slam.config import SlamConfig
 from scanweld.slam.motion import POSED, UNSEEN
-from scanweld.slam.system import Slam, SlamConfig, build_slam
+from scanweld.slam.system import Slam, build_slam
 from scanweld.slam.warmup import load_kernels
 from scanweld.state import Stateful
 from scanweld.trajectory import FrameResult, FrameState, Trajectory

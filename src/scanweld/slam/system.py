@@ -5,30 +5,28 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
 from scanweld.arrays import Bool, Float64, as_transform
-from scanweld.config import check_ranges, section, setting
-from scanweld.errors import ConfigError, InvalidInputError
+from scanweld.errors import InvalidInputError
 from scanweld.geometry import se3
 from scanweld.geometry.camera import PinholeCamera
 from scanweld.geometry.depth import SurfaceConfig, SurfacePyramid, build_pyramid
 from scanweld.geometry.frame import Frame
 from scanweld.geometry.views import MapCorrection, ModelView
 from scanweld.loop_closure.joining import Join
-from scanweld.loop_closure.loop_closer import KeyframeLoopCloser, LoopClosingConfig, NoLoopCloser
-from scanweld.mapping.fusion import FusionConfig
+from scanweld.loop_closure.loop_closer import KeyframeLoopCloser, NoLoopCloser
 from scanweld.mapping.mapper import SurfelMapper
 from scanweld.mapping.pipelined import PipelinedMapper
-from scanweld.mapping.storage.pages import MapConfig
 from scanweld.parallel import limited_threads
 from scanweld.refinement.config import RefinementConfig
 from scanweld.refinement.refine import Refinement, refine_keyframes
 from scanweld.registration.result import RegistrationResult, Status
+from scanweld.slam.config import SlamConfig
 from scanweld.slam.frame_log import FrameLog
 from scanweld.slam.health import HealthConfig, TrackingHealth, is_near
 from scanweld.slam.motion import POSED, UNSEEN, ConstantVelocity, trajectory_of
@@ -37,36 +35,8 @@ from scanweld.slam.stages import DeferringLoopCloser, DeferringMapper, LoopClose
 from scanweld.slam.submaps import Atlas, SubmapConfig, in_one_world, main_submap
 from scanweld.state import Stateful
 from scanweld.tracking.dynamics import DynamicsConfig, MotionDetector, leave_out, track_static
-from scanweld.tracking.tracker import FrameToModelTracker, TrackingConfig
+from scanweld.tracking.tracker import FrameToModelTracker
 from scanweld.trajectory import FrameResult, FrameState, Trajectory
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SlamConfig:
-    """Everything that a run depends on besides its input."""
-
-    seed: int = setting(0, "seed of whatever is random", low=0)
-    surfaces: SurfaceConfig = section(SurfaceConfig, "how depth becomes surfaces")
-    tracking: TrackingConfig = section(TrackingConfig, "how a frame is aligned with the map")
-    fusion: FusionConfig = section(FusionConfig, "how a frame is merged into the map")
-    map: MapConfig = section(MapConfig, "where the map is kept")
-    health: HealthConfig = section(HealthConfig, "when a tracked pose is not believed")
-    submaps: SubmapConfig = section(SubmapConfig, "when a lost camera begins a new map")
-    dynamics: DynamicsConfig = section(DynamicsConfig, "what counts as moving, and is kept out of the map")
-    loop_closer: str = setting(
-        "keyframes",
-        "keyframes remembers places, finds a lost camera and closes loops; none does without: odometry alone",
-    )
-    refinement: RefinementConfig = section(RefinementConfig, "how keyframes are adjusted after a run, if asked for")
-    loop_closing: LoopClosingConfig = section(LoopClosingConfig, "how places are remembered, and loops closed")
-
-    def __post_init__(self) -> None:
-        check_ranges(self)
-        if self.loop_closer not in _LOOP_CLOSERS:
-            raise ConfigError(f"loop_closer = {self.loop_closer!r}: expected {' or '.join(_LOOP_CLOSERS)}")
-
-
-_LOOP_CLOSERS = ("keyframes", "none")
 
 
 class Slam(Stateful):

@@ -19,7 +19,7 @@ from scanweld.datasets.gyroscope import gyroscope_of
 from scanweld.errors import ConfigError, FileFormatError, InvalidInputError, UnreadableFrameError
 from scanweld.geometry.frame import Frame
 from scanweld.mapping.storage.pages import MapConfig
-from scanweld.slam.system import SlamConfig
+from scanweld.slam.config import SlamConfig
 
 
 def identity_of(sequence: RgbdSequence, config: SlamConfig, given: Sequence[Float64 | None] | None) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from scanweld.geometry.frame import Frame
 from scanweld.runs.checkpoint import encoding, file
 from scanweld.runs.checkpoint.identity import check_frames, check_identity, digest_of, identity_of
 from scanweld.runs.folder import CHECKPOINT, MARK
-from scanweld.slam.system import SlamConfig
+from scanweld.slam.config import SlamConfig
 from scanweld.state import Stateful
 
 EVERY_S = 60.0
