@@ -95,7 +95,7 @@ class SurfelMapper(Stateful):
         pages.follow(pages.capacity if everything else PAGES_A_FRAME)
         at_most, most = 0 if everything else PAGES_A_FRAME, self.config.max_confidence
         merge_doubled(self.map, most, self.config.merging, at_most=at_most)
-        if not everything:
+        if not everything and self._frames_fused % THINNING_INTERVAL == 0:
             thin_crowded(self.map, most)
 
 
@@ -122,6 +122,9 @@ sight since is missing on one side, and that has shown no loss of accuracy (docs
 
 PAGES_A_FRAME = 32
 """Pages that follow a correction with each frame though they are out of view, and that are looked at for layers."""
+
+THINNING_INTERVAL = 4
+"""Frames from one crowded cell that is thinned to the next."""
 
 MOSTLY_NEW = 0.05
 """Where so many surfels were added, as a share of those seen, the map has to be looked at again."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -361,26 +362,27 @@ def _refine(
     return fill_free(end.T_target_source, points, lits, photometry, end.stride, geometry, end.parts, gates)
 
 
-def schedules(config: ProjectiveConfig) -> Iterator[ProjectiveConfig]:
-    """Yield the configured schedule, then wider and more tolerant ones for when it fails.
+@lru_cache(maxsize=16)
+def schedules(config: ProjectiveConfig) -> tuple[ProjectiveConfig, ...]:
+    """Return the configured schedule, then wider and more tolerant ones for when it fails.
 
     Which coarse gate has the largest basin depends on the scene: one that is wide enough for the motion takes in wrong
     neighbours. The free-space check tells a right answer from a wrong one, so trying several is safe; it is strict
     where the search is wide, whatever the configuration allows to a prediction that is known to be close.
     """
-    yield config
-    strict = ProjectiveConfig()
-    config = replace(
+    usual = ProjectiveConfig()
+    strict = replace(
         config,
-        min_agreement=max(config.min_agreement, strict.min_agreement),
-        max_conflict=min(config.max_conflict, strict.max_conflict),
+        min_agreement=max(config.min_agreement, usual.min_agreement),
+        max_conflict=min(config.max_conflict, usual.max_conflict),
     )
-    gate = config.coarse_gate_m * 2
+    found, gate = [config], config.coarse_gate_m * 2
     while gate <= config.widest_gate_m:
-        yield replace(config, coarse_gate_m=gate, min_cosine=min(config.min_cosine, 0.0))
+        found.append(replace(strict, coarse_gate_m=gate, min_cosine=min(config.min_cosine, 0.0)))
         if gate * 2 > config.widest_gate_m:
-            yield replace(config, coarse_gate_m=gate)
+            found.append(replace(strict, coarse_gate_m=gate))
         gate *= 2
+    return tuple(found)
 
 
 def _centroid_and_radius(points_m: Float64) -> tuple[Float64, float]:

@@ -28,7 +28,7 @@ from scanweld.io.ply import write_ply
 from scanweld.io.trajectory_files import write_tum
 from scanweld.mapping.rendering import render_picture
 from scanweld.mapping.surfel_map import SurfelMap
-from scanweld.parallel import get_num_threads, processor
+from scanweld.parallel import get_num_threads, processor, side_by_side
 from scanweld.report.page import write_report
 from scanweld.report.plots import plot_path, plot_tracking
 from scanweld.slam.config import SlamConfig
@@ -69,14 +69,11 @@ def write_run(
     write_ply(folder / "map.ply", slam.map)
     write_submaps(folder, slam)
     write_frames(folder / "frames.csv", slam.results)
-    write_renders(folder / "renders", slam.map, trajectory, sequence.camera)
-    plots = folder / "plots"
-    plots.mkdir()
-    plot_tracking(slam.results, plots / "tracking.png")
-    if error is not None:
-        plot_trajectory_error(error, plots / "trajectory.png", title=sequence.name)
-    else:
-        plot_path(trajectory.positions_m, plots / "trajectory.png", f"{sequence.name}: estimated path")
+    surfels = slam.map
+    side_by_side(
+        lambda: write_plots(folder / "plots", slam.results, trajectory, error, sequence.name),
+        lambda: write_renders(folder / "renders", surfels, trajectory, sequence.camera),
+    )
     if sequence.ground_truth is not None:
         write_tum(folder / "groundtruth.txt", sequence.ground_truth)
     write_keyframes(folder / "keyframes.csv", slam.loop_closer)
@@ -129,6 +126,18 @@ def write_keyframes(path: Path, loop_closer: LoopCloser) -> None:
         writer = csv.writer(file)
         writer.writerow(["frame", "loop"])
         writer.writerows([frame, " ".join(tied.get(k, ()))] for k, frame in enumerate(frames))
+
+
+def write_plots(
+    folder: Path, results: Sequence[FrameResult], trajectory: Trajectory, error: AteResult | None, name: str
+) -> None:
+    """Draw how tracking went, and the path: beside the truth, where there is one."""
+    folder.mkdir()
+    plot_tracking(results, folder / "tracking.png")
+    if error is not None:
+        plot_trajectory_error(error, folder / "trajectory.png", title=name)
+    else:
+        plot_path(trajectory.positions_m, folder / "trajectory.png", f"{name}: estimated path")
 
 
 def write_renders(folder: Path, surfels: SurfelMap, trajectory: Trajectory, camera: PinholeCamera) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
+from statistics import median
 from typing import ClassVar
 
 import numpy as np
@@ -74,9 +75,9 @@ class TrackingHealth(Stateful):
         if aligned.overlap < max(low, self.config.least_overlap):
             signs.append(f"overlap {aligned.overlap:.0%}, usually above {max(low, self.config.least_overlap):.0%}")
         shift, turn = _leap(aligned.T_target_source, T_predicted)
-        usual = np.median(np.array(self._leaps), axis=0)
-        if shift > max(self.config.leap * usual[0], _LEAST_LEAP_M) or turn > max(
-            self.config.leap * usual[1], _LEAST_LEAP_RAD
+        usual_shift, usual_turn = (median(leaps) for leaps in zip(*self._leaps, strict=True))
+        if shift > max(self.config.leap * usual_shift, _LEAST_LEAP_M) or turn > max(
+            self.config.leap * usual_turn, _LEAST_LEAP_RAD
         ):
             signs.append(f"{shift:.3f} m and {np.rad2deg(turn):.1f} degrees from where the motion was going")
         return "; ".join(signs) if len(signs) >= self.config.signs else ""
@@ -101,7 +102,6 @@ def _leap(T: Float64, T_predicted: Float64) -> tuple[float, float]:
 
 def _limit(values: deque[float], deviations: float) -> float:
     """Return the median plus so many robust standard deviations."""
-    array = np.array(values)
-    middle = float(np.median(array))
-    spread = max(1.4826 * float(np.median(np.abs(array - middle))), _LEAST_SPREAD * middle)
+    middle = median(values)
+    spread = max(1.4826 * median(abs(value - middle) for value in values), _LEAST_SPREAD * middle)
     return middle + deviations * spread

@@ -97,7 +97,7 @@ class _Evidence:
         """(K,), to where the brightness agrees; without texture that may be anywhere, and is no place to go."""
         along = self.textured
         score = along.T @ self.scores.sum(axis=0)
-        return np.asarray(-along @ solve_or_zero(along.T @ self.slopes @ along, score))
+        return np.asarray(-along @ np.linalg.lstsq(along.T @ self.slopes @ along, score, rcond=1e-10)[0])  # no symmetry
 
     @property
     def information(self) -> Float64:

@@ -180,5 +180,8 @@ def refine_observed(
 
 
 def solve_or_zero(H: Float64, g: Float64) -> Float64:
-    """Return H^-1 g; directions without any information stay zero."""
-    return np.asarray(np.linalg.lstsq(H, g, rcond=1e-10)[0])
+    """Return H^-1 g of a symmetric H, not negative; directions without any information stay zero."""
+    values, vectors = np.linalg.eigh(H)
+    known = values > 1e-10 * values.max(initial=0.0)
+    along = vectors[:, known]
+    return np.asarray((along / values[known]) @ (along.T @ g))
