@@ -137,7 +137,8 @@ class TestRun:
         assert "keep pace" in rows[5]["note"]
         assert json.loads((told.folder / "run.json").read_text())["realtime"] is True
         assert json.loads((told.folder / "metrics.json").read_text())["frames_dropped"] == 3
-        assert judge(read_run_files(told.folder)).reasons[0].startswith("3 frames of 14 were dropped")
+        files = read_run_files(told.folder)
+        assert judge(files.frames, files.metrics, files.run).reasons[0].startswith("3 frames of 14 were dropped")
         assert "3 frames of 14 were dropped" in (told.folder / "report.html").read_text()
         assert "11 of 14 tracked, 3 dropped to keep pace" in summary_text(told)
 

@@ -25,7 +25,6 @@ from scanweld.report.page import MAX_ROWS, make_page, write_report
 from scanweld.report.plots import plot_tracking
 from scanweld.report.run_files import (
     FrameTable,
-    RunFiles,
     poses_of_frames,
     read_frames,
     read_keyframes,
@@ -113,13 +112,7 @@ class TestStretches:
 def judge_table(frames: FrameTable, ate_m: float | None = 0.001, **run: object) -> Verdict:
     """Judge a run of 10 m with these frames."""
     metrics = {"path_length_m": 10.0} | ({} if ate_m is None else {"ate_rmse_m": ate_m, "ate_max_m": 2 * ate_m})
-    nothing = np.empty((0, 2), np.int64)
-    return judge(
-        RunFiles(
-            name="", frames=frames, trajectory=path(len(frames)), truth=None, surfels={}, metrics=metrics, run=run,
-            config_text="", config={}, renders=(), keyframes=nothing[:, 0], loops=nothing,
-        )
-    )  # fmt: skip
+    return judge(frames, metrics, run)
 
 
 class TestVerdict:

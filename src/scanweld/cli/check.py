@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from scanweld.cli.completion import formats
+from scanweld.cli.sequence_options import Camera, DepthScale, Format, Frames, Topics
 
 if TYPE_CHECKING:
     from scanweld.checkup.findings import Checkup
@@ -23,15 +23,11 @@ COLUMNS = 100
 
 def check(
     sequence: Annotated[Path, typer.Argument(help="Sequence: a folder or a recording, as for slam.")],
-    format_name: Annotated[
-        str, Option("--format", help="Format of the sequence, as for slam.", autocompletion=formats)
-    ] = "auto",
-    topics: Annotated[
-        str | None, Option(help="Topics of a bag, where it has several.", metavar="depth=/A,color=/B")
-    ] = None,
-    camera: Annotated[str | None, Option(help="Intrinsics of the images on disk.", metavar="FX,FY,CX,CY")] = None,
-    depth_scale: Annotated[float | None, Option(help="Depth units per metre, for example 5000.")] = None,
-    frames: Annotated[str | None, Option(help="Look at a part of the frames.", metavar="A:B[:STEP]")] = None,
+    format_name: Format = "auto",
+    topics: Topics = None,
+    camera: Camera = None,
+    depth_scale: DepthScale = None,
+    frames: Frames = None,
     json_output: Annotated[bool, Option("--json", help="Print findings and figures as one JSON object.")] = False,
 ) -> int:
     """Look for what is wrong with a recording before it is used, and say what to do about it.
@@ -41,20 +37,10 @@ def check(
     """
     started = time.perf_counter()
     from scanweld.checkup.examine import examine_input
-    from scanweld.datasets.intrinsics import parse_intrinsics
-    from scanweld.datasets.open import open_sequence
+    from scanweld.runs.input import RunInput
 
-    checkup = examine_input(
-        sequence,
-        lambda: open_sequence(
-            sequence,
-            format=format_name,
-            camera=parse_intrinsics(camera) if camera else None,
-            depth_scale=depth_scale,
-            frames=frames,
-            topics=topics,
-        ),
-    )
+    source = RunInput(str(sequence), format_name, frames, camera=camera, depth_scale=depth_scale, topics=topics)
+    checkup = examine_input(sequence, source.open)
     seconds = time.perf_counter() - started
     if json_output:
         typer.echo(json.dumps({**checkup.as_dict(), "seconds": seconds}))

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from scanweld.cli.completion import slam_settings
+from scanweld.cli.sequence_options import Overrides
 from scanweld.errors import ConfigError
 
 
@@ -22,12 +22,7 @@ class Action(StrEnum):
 def config(
     action: Annotated[Action, typer.Argument(help="show: print all settings; check: say whether a file is sound.")],
     file: Annotated[Path | None, typer.Argument(help="Settings that differ from the defaults.")] = None,
-    overrides: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--set", help="Set one value, for example tracking.stable_fraction=0.1.", autocompletion=slam_settings
-        ),
-    ] = None,
+    overrides: Overrides = None,
 ) -> int:
     """Show every setting of `slam` as commented TOML, or check a file of settings.
 

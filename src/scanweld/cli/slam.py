@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
-import logging
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from scanweld.cli.completion import formats, slam_settings
+from scanweld.cli.sequence_options import Camera, Config, DepthScale, Format, Frames, Overrides, Scale, Topics
 from scanweld.cli.view import HOST, PORT, opened_observers
 
 if TYPE_CHECKING:
@@ -33,28 +31,15 @@ def slam(
         ),
     ],
     out: Annotated[Path | None, Option(help="Run folder. Default: runs/SEQUENCE-N.", metavar="RUN")] = None,
-    format_name: Annotated[
-        str,
-        Option(
-            "--format",
-            help="auto, 7scenes, bonn, bundlefusion, eth3d, icl, realsense, record3d, redwood, replica, rosbag, "
-            "scannet, stray, tum, video.",
-            autocompletion=formats,
-        ),
-    ] = "auto",
-    topics: Annotated[
-        str | None, Option(help="Topics of a bag, where it has several.", metavar="depth=/A,color=/B")
-    ] = None,
-    camera: Annotated[str | None, Option(help="Intrinsics of the images on disk.", metavar="FX,FY,CX,CY")] = None,
-    depth_scale: Annotated[float | None, Option(help="Depth units per metre, for example 5000.")] = None,
-    frames: Annotated[str | None, Option(help="Use a part of the frames.", metavar="A:B[:STEP]")] = None,
-    scale: Annotated[float, Option(help="Resize the images, for example 0.5.")] = 1.0,
+    format_name: Format = "auto",
+    topics: Topics = None,
+    camera: Camera = None,
+    depth_scale: DepthScale = None,
+    frames: Frames = None,
+    scale: Scale = 1.0,
     poses: Annotated[str | None, Option(help="Fuse at given poses instead of tracking.", metavar="truth|FILE")] = None,
-    config: Annotated[Path | None, Option(help="Configuration file.", metavar="F.toml")] = None,
-    overrides: Annotated[
-        list[str] | None,
-        Option("--set", help="Set one value, for example tracking.stable_fraction=0.1.", autocompletion=slam_settings),
-    ] = None,
+    config: Config = None,
+    overrides: Overrides = None,
     threads: Annotated[int | None, Option(help="Number of threads. Default: all cores.", min=1)] = None,
     tracked_only: Annotated[
         bool, Option("--tracked-only", help="Leave frames without a measured pose out of trajectory.txt.")
@@ -89,35 +74,23 @@ def slam(
     Exit code 3 says that the run ended LOST or tracked fewer than half of the frames; its folder is complete.
     """
     started = time.perf_counter()
-    from scanweld.datasets.base import LiveSequence
-    from scanweld.datasets.intrinsics import parse_intrinsics
-    from scanweld.datasets.open import open_sequence
     from scanweld.errors import ConfigError
+    from scanweld.runs.folder import next_run_folder
+    from scanweld.runs.input import RunInput, collected_warnings
     from scanweld.runs.reopen import given_poses
 
     settings = load_config(config, overrides or [])
+    source = RunInput(str(sequence), format_name, frames, scale, camera, depth_scale, topics)
     with collected_warnings() as warnings:
-        opened = open_sequence(
-            sequence,
-            format=format_name,
-            camera=parse_intrinsics(camera) if camera else None,
-            depth_scale=depth_scale,
-            frames=frames,
-            scale=scale,
-            topics=topics,
-        )
-    from scanweld.runs.folder import next_run_folder
-
+        opened = source.open()
     if resume and out is None:
         raise ConfigError("--resume: --out RUN has to say which run is to be continued")
     folder = out or next_run_folder(opened.name)
     poses_from = poses if poses in (None, "truth") else str(Path(poses).resolve())
     given = None if poses_from is None else given_poses(opened, poses_from)
-    place = str(sequence if isinstance(opened, LiveSequence) else sequence.resolve())
     description = {
-        "input": place, "format": format_name, "frames": frames, "scale": scale, "poses": poses_from,
-        "camera": camera, "depth_scale": depth_scale, "topics": topics, "config": str(config) if config else None,
-        "set": overrides or [], "warnings": warnings,
+        **source.described(), "poses": poses_from, "config": str(config) if config else None, "set": overrides or [],
+        "warnings": warnings,
     }  # fmt: skip
     with opened_observers(opened.name, view=view, host=view_host, port=view_port, rerun=rerun) as observers:
         summary = run_with_progress(
@@ -129,20 +102,6 @@ def slam(
         if not summary.interrupted:
             observers.stay()
     return code
-
-
-@contextlib.contextmanager
-def collected_warnings() -> Iterator[list[str]]:
-    """Yield a list that grows by what the library warns of meanwhile."""
-    messages: list[str] = []
-    handler = logging.Handler(logging.WARNING)
-    handler.emit = lambda record: messages.append(record.getMessage())  # type: ignore[method-assign]
-    library = logging.getLogger("scanweld")
-    library.addHandler(handler)
-    try:
-        yield messages
-    finally:
-        library.removeHandler(handler)
 
 
 def load_config(path: Path | None, overrides: list[str]) -> SlamConfig:

@@ -81,7 +81,7 @@ def make_page(run: RunFiles) -> str:
     stride = -(-len(run.frames) // MAX_FRAMES)
     shown = np.arange(0, len(run.frames), stride)
     error = evaluate(run.trajectory, run.truth)
-    verdict, stretches = judge(run), find_stretches(run.frames)
+    verdict, stretches = judge(run.frames, run.metrics, run.run), find_stretches(run.frames)
     accuracy = accuracy_charts(run, error, shown) if error is not None else []
     tracking = tracking_charts(run.frames, shown)
     scene, points = _scene(run, shown, error)

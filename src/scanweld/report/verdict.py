@@ -5,13 +5,13 @@ The rules are few, the same for every sequence, and told in docs/report.md.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from scanweld.report.run_files import FrameTable, RunFiles
+from scanweld.report.run_files import FrameTable
 from scanweld.report.stretches import kinds_of
 from scanweld.report.words import count_of, length, percent
 
@@ -75,14 +75,14 @@ class _Case:
         return Verdict(level, (*self.against, *self.reservations, *self.favour), tuple(self.advice))
 
 
-def judge(files: RunFiles) -> Verdict:
-    """Return what to think of a run."""
+def judge(frames: FrameTable, metrics: Mapping[str, Any], run: Mapping[str, Any]) -> Verdict:
+    """Return what to think of a run, by what frames.csv, metrics.json and run.json hold."""
     case = _Case()
-    _judge_tracking(case, files.frames)
-    _judge_alignment(case, files.frames)
-    _judge_pieces(case, files.frames)
-    _judge_truth(case, files.metrics)
-    _judge_circumstances(case, files.run)
+    _judge_tracking(case, frames)
+    _judge_alignment(case, frames)
+    _judge_pieces(case, frames)
+    _judge_truth(case, metrics)
+    _judge_circumstances(case, run)
     return case.verdict()
 
 

@@ -10,8 +10,6 @@ from typing import Any
 from scanweld.arrays import Bool, Float64, Int64
 from scanweld.config import from_mapping
 from scanweld.datasets.base import RgbdSequence
-from scanweld.datasets.intrinsics import parse_intrinsics
-from scanweld.datasets.open import open_sequence
 from scanweld.datasets.synthetic import RenderConfig, SyntheticSequence
 from scanweld.errors import DatasetError, FileFormatError
 from scanweld.geometry.camera import PinholeCamera
@@ -20,6 +18,7 @@ from scanweld.refinement.calibration import DepthCorrection
 from scanweld.report.run_files import FrameTable, check_run_folder, poses_of_frames, read_frames, read_json
 from scanweld.runs.calibrated import CalibratedSequence
 from scanweld.runs.folder import MARK
+from scanweld.runs.input import RunInput
 from scanweld.trajectory import Trajectory
 
 
@@ -99,16 +98,7 @@ def reopen_input(run: Mapping[str, Any]) -> RgbdSequence:
     place = Path(str(run.get("input") or ""))
     if not run.get("input") or not place.exists():
         raise DatasetError(f"the sequence of the run is not there any more: {run.get('input') or 'it has no path'}")
-    options: dict[str, Any] = {"topics": run["topics"]} if run.get("topics") else {}
-    return open_sequence(
-        place,
-        format=run.get("format") or "auto",
-        camera=parse_intrinsics(run["camera"]) if run.get("camera") else None,
-        depth_scale=run.get("depth_scale"),
-        frames=run.get("frames"),
-        scale=run.get("scale") or 1.0,
-        **options,
-    )
+    return RunInput.of_run(run).open()
 
 
 def given_poses(sequence: RgbdSequence, source: str) -> Trajectory:

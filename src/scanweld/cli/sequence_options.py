@@ -1,0 +1,32 @@
+"""Options of all commands that open a sequence or configure SLAM, declared once."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from scanweld.cli.completion import formats, slam_settings
+
+Option = typer.Option
+
+Format = Annotated[
+    str,
+    Option(
+        "--format",
+        help="auto, 7scenes, bonn, bundlefusion, eth3d, icl, realsense, record3d, redwood, replica, rosbag, "
+        "scannet, stray, tum, video.",
+        autocompletion=formats,
+    ),
+]
+Topics = Annotated[str | None, Option(help="Topics of a bag, where it has several.", metavar="depth=/A,color=/B")]
+Camera = Annotated[str | None, Option(help="Intrinsics of the images on disk.", metavar="FX,FY,CX,CY")]
+DepthScale = Annotated[float | None, Option(help="Depth units per metre, for example 5000.")]
+Frames = Annotated[str | None, Option(help="Use a part of the frames.", metavar="A:B[:STEP]")]
+Scale = Annotated[float, Option(help="Resize the images, for example 0.5.")]
+Config = Annotated[Path | None, Option(help="Configuration file.", metavar="F.toml")]
+Overrides = Annotated[
+    list[str] | None,
+    Option("--set", help="Set one value, for example tracking.stable_fraction=0.1.", autocompletion=slam_settings),
+]
