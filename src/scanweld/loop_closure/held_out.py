@@ -122,17 +122,22 @@ def _views_alike(
     T_camera_world = se3.inverse(np.stack([keyframe.T_world_camera for keyframe in others]))
     pairs = []
     for asker in askers:
-        motion = T_camera_world @ T_kept_joined @ asker.T_world_camera
-        apart = np.linalg.norm(motion[:, :3, 3], axis=1) / _SIDEWAYS_M + se3.rotation_angle_rad(motion)
+        apart = views_apart(T_camera_world @ T_kept_joined @ asker.T_world_camera)
         pairs.append((float(apart.min()), others[int(apart.argmin())], asker))
     # Those far from everything see no common ground; of the others, an even share.
-    near = [(a, b) for apart, a, b in pairs if apart < _APART]
+    near = [(a, b) for apart, a, b in pairs if apart < APART]
     for k in np.unique(np.linspace(0, len(near) - 1, min(_ACROSS, len(near))).astype(int)) if near else ():
         yield near[k]
 
 
-_APART = 1.2
+APART = 1.2
 """Views that are further apart, in metres and radians together, hardly see common ground."""
+
+
+def views_apart(motions: Float64) -> Float64:
+    """Return how far apart (N,) two views are that lie a motion (N, 4, 4) from each other, metres and radians added."""
+    apart = np.linalg.norm(motions[..., :3, 3], axis=-1) / _SIDEWAYS_M + se3.rotation_angle_rad(motions)
+    return np.asarray(apart)
 
 
 def _pairs(count: int, i: int, j: int) -> Iterator[tuple[int, int]]:

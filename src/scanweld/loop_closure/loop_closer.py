@@ -28,14 +28,12 @@ from scanweld.loop_closure.joining import Join, JoinFinder
 from scanweld.loop_closure.keyframes import Keyframe, Sighting
 from scanweld.loop_closure.place_recognition import KeyframeDatabase, PlaceConfig
 from scanweld.loop_closure.place_verification import VerificationConfig, relocalise
-from scanweld.loop_closure.search import Edge, Found, Query, find_place
+from scanweld.loop_closure.search import Edge, Found, Query, find_place, tracked_edge
 from scanweld.parallel import get_num_threads, in_background, limited_threads
 from scanweld.registration.result import RegistrationResult, Status
 from scanweld.state import Stateful
 from scanweld.trajectory import FrameResult
 
-_LEAST_SIGMA_M, _LEAST_SIGMA_RAD = 1e-3, 1e-3  # of the motion between two keyframes, however short
-_SIGMA_RAD_PER_M = 0.005
 _UNSEEN_SIGMA = 0.3  # m and rad: what is known of the motion while nothing was seen
 
 
@@ -137,6 +135,16 @@ class KeyframeLoopCloser(Stateful):
         """Pairs of keyframes that loops tie together."""
         return [(edge.i, edge.j) for edge in self._edges if edge.loop]
 
+    @property
+    def edges(self) -> list[Edge]:
+        """The motions between keyframes that are known: from one to the next, and those of loops and joins."""
+        return list(self._edges)
+
+    @property
+    def submaps(self) -> Int64:
+        """The submap (K,) of each keyframe."""
+        return self._submaps.copy()
+
     def process(self, pyramid: SurfacePyramid, result: FrameResult) -> MapCorrection | Join | None:
         """Look at a tracked frame; return a correction where a loop is closed, or what joins two submaps.
 
@@ -235,14 +243,10 @@ class KeyframeLoopCloser(Stateful):
     def _odometry(self, before: Keyframe, keyframe: Keyframe) -> Edge:
         """Return the edge from the keyframe before; how well the motion is known grows with its length."""
         T_i_j = se3.inverse(before.T_world_camera) @ keyframe.T_world_camera
-        length, turn = float(np.linalg.norm(T_i_j[:3, 3])), float(se3.rotation_angle_rad(T_i_j))
-        drift = self.config.drift
-        sigma_m = _LEAST_SIGMA_M + drift * length
-        sigma_rad = _LEAST_SIGMA_RAD + _SIGMA_RAD_PER_M * length + drift * turn
-        if not self._seen_since:  # it was found again against the map, which is a measurement, too, but of another kind
-            sigma_m, sigma_rad = _UNSEEN_SIGMA, _UNSEEN_SIGMA
-        sigmas = np.repeat([sigma_m, sigma_rad], 3)
-        return Edge(before.index, keyframe.index, T_i_j, np.diag(sigmas**-2.0), False)
+        if self._seen_since:
+            return tracked_edge(before.index, keyframe.index, T_i_j, self.config.drift)
+        # It was found again against the map, which is a measurement, too, but of another kind.
+        return Edge(before.index, keyframe.index, T_i_j, np.eye(6) * _UNSEEN_SIGMA**-2.0, False)
 
     def _consider(self, pyramid: SurfacePyramid, result: FrameResult) -> None:
         """Make a frame a keyframe if there is a reason to, and ask where else its place is known."""

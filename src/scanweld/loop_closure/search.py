@@ -25,6 +25,9 @@ logger = logging.getLogger(__name__)
 _KEPT_WEIGHT = 0.5
 """Robust weight of an edge that was not dropped."""
 
+_LEAST_SIGMA_M, _LEAST_SIGMA_RAD = 1e-3, 1e-3  # of the motion between two keyframes, however short
+_SIGMA_RAD_PER_M = 0.005
+
 
 @dataclass(frozen=True, slots=True)
 class Edge:
@@ -35,6 +38,14 @@ class Edge:
     T_i_j: Float64
     information: Float64
     loop: bool
+
+
+def tracked_edge(i: int, j: int, T_i_j: Float64, drift: float, *, loop: bool = False) -> Edge:
+    """Return the edge between two keyframes that were tracked in one map; its uncertainty grows with its length."""
+    length, turn = float(np.linalg.norm(T_i_j[:3, 3])), float(se3.rotation_angle_rad(T_i_j))
+    sigma_m = _LEAST_SIGMA_M + drift * length
+    sigma_rad = _LEAST_SIGMA_RAD + _SIGMA_RAD_PER_M * length + drift * turn
+    return Edge(i, j, T_i_j, np.diag(np.repeat([sigma_m, sigma_rad], 3) ** -2.0), loop)
 
 
 @dataclass(frozen=True, slots=True)

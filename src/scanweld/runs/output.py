@@ -31,10 +31,9 @@ from scanweld.mapping.surfel_map import SurfelMap
 from scanweld.parallel import get_num_threads, processor, side_by_side
 from scanweld.report.page import write_report
 from scanweld.report.plots import plot_path, plot_tracking
+from scanweld.runs.summary import Outcome
 from scanweld.slam.config import SlamConfig
 from scanweld.slam.motion import trajectory_of
-from scanweld.slam.stages import LoopCloser
-from scanweld.slam.system import Slam
 from scanweld.trajectory import FrameResult, Trajectory
 
 logger = logging.getLogger(__name__)
@@ -52,7 +51,7 @@ STAGES = ("surfaces", "view", "track", "fuse", "loop")
 
 def write_run(
     folder: Path,
-    slam: Slam,
+    outcome: Outcome,
     sequence: RgbdSequence,
     config: SlamConfig,
     metrics: dict[str, Any],
@@ -63,20 +62,19 @@ def write_run(
     started: float,
 ) -> None:
     """Write every file of a run into an empty folder; metrics["seconds_total"] is brought up to date."""
-    trajectory = slam.trajectory
+    trajectory = outcome.trajectory
     (folder / "config.toml").write_text(to_toml(config), encoding="utf-8")
-    write_tum(folder / "trajectory.txt", trajectory_of(slam.main_results, tracked_only=tracked_only))
-    write_ply(folder / "map.ply", slam.map)
-    write_submaps(folder, slam)
-    write_frames(folder / "frames.csv", slam.results)
-    surfels = slam.map
+    write_tum(folder / "trajectory.txt", trajectory_of(outcome.main_results, tracked_only=tracked_only))
+    write_ply(folder / "map.ply", outcome.map)
+    write_submaps(folder, outcome)
+    write_frames(folder / "frames.csv", outcome.results)
     side_by_side(
-        lambda: write_plots(folder / "plots", slam.results, trajectory, error, sequence.name),
-        lambda: write_renders(folder / "renders", surfels, trajectory, sequence.camera),
+        lambda: write_plots(folder / "plots", outcome.results, trajectory, error, sequence.name),
+        lambda: write_renders(folder / "renders", outcome.map, trajectory, sequence.camera),
     )
     if sequence.ground_truth is not None:
         write_tum(folder / "groundtruth.txt", sequence.ground_truth)
-    write_keyframes(folder / "keyframes.csv", slam.loop_closer)
+    write_keyframes(folder / "keyframes.csv", outcome)
     recording = {"name": sequence.name, "intrinsics": asdict(sequence.camera)}
     _write_json(folder / "run.json", {**_environment(config), **recording, **description})
     metrics["seconds_total"] = time.perf_counter() - started
@@ -87,11 +85,11 @@ def write_run(
         logger.exception("report.html could not be made; `scanweld report` tries again")
 
 
-def write_submaps(folder: Path, slam: Slam) -> None:
+def write_submaps(folder: Path, outcome: Outcome) -> None:
     """Write map-K.ply and trajectory-K.txt of each submap K that was not joined, in its own world."""
-    for submap in slam.unjoined:
-        write_ply(folder / f"map-{submap}.ply", slam.maps[submap])
-        mine = [result for result in slam.results if result.submap == submap]
+    for submap in outcome.unjoined:
+        write_ply(folder / f"map-{submap}.ply", outcome.maps[submap])
+        mine = [result for result in outcome.results if result.submap == submap]
         write_tum(folder / f"trajectory-{submap}.txt", trajectory_of(mine, tracked_only=True))
 
 
@@ -113,14 +111,13 @@ def write_frames(path: Path, results: Sequence[FrameResult]) -> None:
             )
 
 
-def write_keyframes(path: Path, loop_closer: LoopCloser) -> None:
+def write_keyframes(path: Path, outcome: Outcome) -> None:
     """Write the frame of every keyframe, and with which earlier keyframes' frames a loop ties it (space between)."""
-    database = getattr(loop_closer, "database", None)  # other loop closers may know no keyframes
-    if database is None:
+    frames = outcome.keyframe_frames
+    if frames is None:
         return
-    frames = [keyframe.frame_index for keyframe in database.keyframes]
     tied: dict[int, list[str]] = {}
-    for i, j in getattr(loop_closer, "loops", ()):
+    for i, j in outcome.loops:
         tied.setdefault(max(i, j), []).append(str(frames[min(i, j)]))
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)

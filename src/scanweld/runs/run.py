@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import logging
-import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -16,18 +14,14 @@ import numpy as np
 from scanweld.arrays import Float64
 from scanweld.checkup.first_look import FirstLook
 from scanweld.datasets.base import LiveSequence, RgbdSequence
-from scanweld.datasets.gyroscope import gyroscope_of
-from scanweld.datasets.images import check_depth_unit, explain_unusable_depth
-from scanweld.datasets.playback import Clock, WallClock, play
-from scanweld.datasets.stream import stream
-from scanweld.errors import DatasetError, InvalidInputError, UnreadableFrameError
-from scanweld.evaluation.surface_metrics import compression_ratio
-from scanweld.evaluation.trajectory_metrics import AteResult, ate, rpe
+from scanweld.datasets.images import explain_unusable_depth
+from scanweld.datasets.playback import Clock, WallClock
+from scanweld.errors import DatasetError, InvalidInputError
 from scanweld.geometry.frame import Frame
 from scanweld.notebook import BAD, DOUBTFUL, GOOD, card
 from scanweld.refinement.refine import Refinement
 from scanweld.runs.calibrated import CalibratedSequence
-from scanweld.runs.checkpoint.identity import digest_of, fingerprint_of
+from scanweld.runs.checkpoint.identity import fingerprint_of
 from scanweld.runs.checkpoint.keeper import Checkpoints
 from scanweld.runs.folder import check_writable, write_folder
 from scanweld.runs.interrupts import Patience
@@ -35,6 +29,8 @@ from scanweld.runs.observer import RunObserver
 from scanweld.runs.output import write_run
 from scanweld.runs.refining import calibrate as calibrate_camera
 from scanweld.runs.refining import described
+from scanweld.runs.summary import summarise
+from scanweld.runs.walk import AfterFrame, Tally, process_all
 from scanweld.slam.config import SlamConfig
 from scanweld.slam.motion import POSED, UNSEEN
 from scanweld.slam.system import Slam, build_slam
@@ -45,10 +41,6 @@ from scanweld.trajectory import FrameResult, FrameState, Trajectory
 logger = logging.getLogger(__name__)
 
 Progress = Callable[[FrameResult], None]
-AfterFrame = Callable[[Slam, Frame | None, FrameResult], None]
-
-UNIT_CHECK_FRAMES = 5
-"""Frames whose depth is looked at for a wrong unit."""
 
 HELD_S = 0.1
 """A run that is held looks this often whether it is to end."""
@@ -108,43 +100,16 @@ class RunSummary:
 
 
 @dataclass(slots=True)
-class _Tally:
-    """What is counted while frames go by."""
-
-    num_points_input: int = 0
-    content: int = 0  # checksum of what the frames show
-    median_depth_m: float = 0.0  # of the first frame with depth
-    unit_doubted: bool = False
-    warnings: list[str] = field(default_factory=list)
-
-    def warn(self, message: str) -> None:
-        logger.warning(message)
-        self.warnings.append(message)
-
-    def count(self, index: int, frame: Frame, depth_scale: float) -> None:
-        """Count what a frame measured, and doubt the unit of the first ones once."""
-        depth_m = frame.depth_m
-        self.content = digest_of(frame, self.content)
-        self.num_points_input += int(np.count_nonzero(depth_m))
-        if index < UNIT_CHECK_FRAMES and not self.unit_doubted and depth_m.any():
-            self.median_depth_m = float(np.median(depth_m[depth_m > 0]))
-            advice = check_depth_unit(self.median_depth_m, depth_scale)
-            if advice:
-                self.unit_doubted = True
-                self.warn(advice)
-
-
-@dataclass(slots=True)
 class _Run(Stateful):
     """A run so far. An interruption at any time leaves it whole: map and sequence are of the same camera."""
 
-    STATE: ClassVar = {"slam": Stateful, "tally": _Tally, "resumed_at": list[int]}
+    STATE: ClassVar = {"slam": Stateful, "tally": Tally, "resumed_at": list[int]}
     MADE = frozenset({"sequence", "config", "refinements", "interrupted"})
 
     sequence: RgbdSequence
     config: SlamConfig
     slam: Slam
-    tally: _Tally = field(default_factory=_Tally)
+    tally: Tally = field(default_factory=Tally)
     refinements: list[Refinement] = field(default_factory=list)
     interrupted: bool = False
     resumed_at: list[int] = field(default_factory=list)  # frames that were the first after a resumption
@@ -165,7 +130,7 @@ class _Run(Stateful):
         self.refinements.append(found)
         if found.recalibrated:
             again = build_slam(calibrated.camera, self.config)
-            _process_all(again, calibrated, _Tally(), None, after_frame)
+            process_all(again, calibrated, Tally(), None, after_frame)
             self.slam, self.sequence = again, calibrated
 
     def refine(self) -> None:
@@ -312,7 +277,7 @@ def run_sequence(
                 played_by = (clock or WallClock()) if realtime else None
                 # Which takes longer than the time between two frames.
                 look = FirstLook(sequence) if timeless else None
-                _process_all(run.slam, sequence, run.tally, given, after_frame, played_by, look)
+                process_all(run.slam, sequence, run.tally, given, after_frame, played_by, look)
                 run.slam.finish()
                 if calibrate or refine:
                     keep(run.slam, -1, None, surely=True)
@@ -355,62 +320,6 @@ def _beside(config: SlamConfig, out: Path | None) -> SlamConfig:
     return replace(config, map=replace(config.map, folder=str(folder)))
 
 
-def _process_all(
-    slam: Slam,
-    sequence: RgbdSequence,
-    tally: _Tally,
-    given: list[Float64 | None] | None,
-    after_frame: AfterFrame,
-    clock: Clock | None = None,
-    look: FirstLook | None = None,
-) -> None:
-    """Walk through a sequence: track each frame, or take its given T_world_camera; with a clock, at its pace."""
-    gyroscope = gyroscope_of(sequence)
-    turned = None if gyroscope is None else gyroscope.orientations(sequence.timestamps_s)
-    if clock is None or isinstance(sequence, LiveSequence):
-        # Two frames ahead: a prepared one of 640x480 holds 20 MB.
-        source = stream(sequence, 2, prepare=slam.prepare, first=len(slam.results))
-    else:
-        source = play(sequence, prepare=slam.prepare, clock=clock)
-    last_read: int | None = None
-    with contextlib.closing(source) as records:
-        for record in records:
-            if record.frame is not None:
-                last_read = record.index
-            elif not record.dropped and last_read is not None and not _can_be_read(sequence, last_read):
-                raise DatasetError(
-                    f"{sequence.name}: frame {record.index} cannot be read ({record.error}), and frame {last_read} "
-                    "not any more; is the recording still there?"
-                )
-            pose = given[record.index] if given is not None else None
-            if record.dropped:
-                result = slam.drop(record.timestamp_s, record.error)
-            elif record.frame is None:
-                tally.warn(f"frame {record.index} is skipped: {record.error}")
-                result = slam.skip(record.timestamp_s, record.error)
-            elif given is not None and pose is None:
-                result = slam.skip(record.timestamp_s, "no given pose")
-            else:
-                tally.count(record.index, record.frame, sequence.depth_scale)
-                for finding in look.see(record.index, record.frame) if look else ():
-                    tally.warn(str(finding))
-                result = slam.process(
-                    record.frame,
-                    pyramid=record.prepared,
-                    T_world_camera=pose,
-                    orientation=None if turned is None else turned[record.index],
-                )
-            after_frame(slam, record.frame, result)
-
-
-def _can_be_read(sequence: RgbdSequence, index: int) -> bool:
-    try:
-        sequence.read(index)
-    except UnreadableFrameError:
-        return False
-    return True
-
-
 def poses_by_frame(sequence: RgbdSequence, poses: Trajectory) -> list[Float64 | None]:
     """Return the given pose of each frame, None where there is none within 0.02 s."""
     if len(poses) == 0:
@@ -428,55 +337,3 @@ def poses_by_frame(sequence: RgbdSequence, poses: Trajectory) -> list[Float64 | 
             f"{poses.timestamps_s[-1]:.3f} s, frames at {times[0]:.3f} to {times[-1]:.3f} s"
         )
     return [poses.T_world_camera[k] if ok else None for k, ok in zip(nearest, close, strict=True)]
-
-
-def summarise(slam: Slam, truth: Trajectory | None, num_points_input: int) -> tuple[dict[str, Any], AteResult | None]:
-    """Return what metrics.json holds, but for seconds_total, and the trajectory error where there is a truth."""
-    results = slam.main_results
-    apart = slam.unjoined
-    states = [result.state for result in results]
-    frame_ms = [sum(result.stage_ms.values()) for result in results if result.stage_ms]
-    error: AteResult | None = None
-    motion: tuple[float | None, float | None] = (None, None)
-    if truth is not None:
-        try:
-            error = ate(slam.trajectory, truth)
-            if error.num_pairs > 1:
-                relative = rpe(slam.trajectory, truth)
-                motion = relative.rmse_trans_m, float(np.degrees(relative.rmse_rot_rad))
-        except InvalidInputError as fault:
-            logger.warning("not evaluated: %s", fault)
-    median_ms = float(np.median(frame_ms)) if frame_ms else None
-    return {
-        "frames": len(results),
-        "frames_tracked": sum(state in POSED for state in states),
-        "frames_lost": states.count(FrameState.LOST),
-        "frames_unreadable": states.count(FrameState.UNREADABLE),
-        "frames_dropped": states.count(FrameState.DROPPED),
-        "relocalisations": states.count(FrameState.RELOCALISED),
-        "loop_closures": slam.loop_closer.num_closures,
-        "submaps_joined": slam.atlas.num_joins,
-        "submaps_unjoined": len(apart),
-        "frames_in_unjoined_submaps": sum(r.state in POSED and r.submap in apart for r in slam.results),
-        "ate_rmse_m": error.rmse_m if error else None,
-        "ate_max_m": error.max_m if error else None,
-        "rpe_trans_m": motion[0],
-        "rpe_rot_deg": motion[1],
-        "path_length_m": slam.trajectory.path_length_m,
-        "num_surfels": len(slam.map),
-        "num_points_input": num_points_input,
-        "compression_ratio": compression_ratio(num_points_input, len(slam.map)) if len(slam.map) else None,
-        "ms_per_frame_median": median_ms,
-        "fps": 1e3 / median_ms if median_ms else None,
-        "peak_rss_mb": peak_rss_mb(),
-    }, error
-
-
-def peak_rss_mb() -> float | None:
-    """Largest resident memory of this process so far [MB]; None where the platform does not tell."""
-    try:
-        import resource
-    except ImportError:  # Windows
-        return None
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / 1e6 if sys.platform == "darwin" else peak / 1e3

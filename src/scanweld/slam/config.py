@@ -12,6 +12,7 @@ from scanweld.mapping.fusion import FusionConfig
 from scanweld.mapping.storage.pages import MapConfig
 from scanweld.refinement.config import RefinementConfig
 from scanweld.slam.health import HealthConfig
+from scanweld.slam.parts import FragmentConfig
 from scanweld.slam.submaps import SubmapConfig
 from scanweld.tracking.dynamics import DynamicsConfig
 from scanweld.tracking.tracker import TrackingConfig
@@ -37,6 +38,7 @@ class SlamConfig:
     )
     refinement: RefinementConfig = section(RefinementConfig, "how keyframes are adjusted after a run, if asked for")
     loop_closing: LoopClosingConfig = section(LoopClosingConfig, "how places are remembered, and loops closed")
+    fragments: FragmentConfig = section(FragmentConfig, "how a recording is cut into fragments, if asked for")
 
     def __post_init__(self) -> None:
         check_ranges(self)

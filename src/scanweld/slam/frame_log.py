@@ -94,6 +94,11 @@ class FrameLog(Sequence[FrameResult], Stateful):
         """Return the submap that a frame is in."""
         return int(self._counts[index, 2])
 
+    @property
+    def keyframes(self) -> Int64:
+        """The keyframe (N,) that each frame moves with."""
+        return self._labels[: self._count, 2].copy()
+
     def follow(self, correction: MapCorrection) -> None:
         """Move the frames with their keyframes."""
         keyframes = self._labels[: self._count, 2]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, ClassVar
 
@@ -88,7 +87,7 @@ class Slam(Stateful):
         return self.atlas.mapper
 
     @property
-    def results(self) -> Sequence[FrameResult]:
+    def results(self) -> FrameLog:
         """One per frame; each is of the submap that the camera was in."""
         self._count()
         return self._results
@@ -120,6 +119,27 @@ class Slam(Stateful):
     def trajectory(self) -> Trajectory:
         """One pose per processed frame, finished; LOST stretches are interpolated where tracking was regained."""
         return trajectory_of(self.main_results)
+
+    @property
+    def num_closures(self) -> int:
+        """Number of loops closed so far."""
+        return self.loop_closer.num_closures
+
+    @property
+    def num_joins(self) -> int:
+        """Number of submaps joined with others so far."""
+        return self.atlas.num_joins
+
+    @property
+    def keyframe_frames(self) -> list[int] | None:
+        """The frame of each keyframe; None where the loop closer keeps none."""
+        database = getattr(self.loop_closer, "database", None)
+        return None if database is None else [keyframe.frame_index for keyframe in database.keyframes]
+
+    @property
+    def loops(self) -> list[tuple[int, int]]:
+        """Pairs of keyframes that loops tie together."""
+        return list(getattr(self.loop_closer, "loops", ()))
 
     def finish(self) -> None:
         """Do at once what stages put off so that no frame has to wait: for use after the last one.

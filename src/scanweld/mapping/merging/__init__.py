@@ -71,6 +71,20 @@ def merge_doubled(surfels: SurfelMap, most: float, config: MergingConfig | None 
     return gone
 
 
+def merge_maps(surfels: SurfelMap, most: float, config: MergingConfig | None = None) -> int:
+    """Fuse the layers of several maps in one, whose surfels have the number of their map as anchor; returns who went.
+
+    Every cell is looked at; parameters are those of :func:`merge_doubled`.
+    """
+    config = config or MergingConfig()
+    if config.distance_m == 0:
+        return 0
+    pages, gone = surfels.pages, 0
+    for cell in np.unique(pages.cells[pages.live]).tolist():
+        gone += _merge_cell(pages, cell, 1, (config.distance_m, _COSINE, most, 1.0))[1]
+    return gone
+
+
 def thin_crowded(surfels: SurfelMap, most: float) -> int:
     """Fuse surfels that share a place, in the cell where most have come since it was looked at; returns who went.
 

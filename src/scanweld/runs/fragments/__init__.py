@@ -1,0 +1,1 @@
+"""A long recording in fragments: each is tracked and fused by itself; then they are tied together and made one."""

@@ -1,0 +1,177 @@
+"""A fragment: a part of a recording that is tracked and fused by itself, and what is kept of it on disk.
+
+Its folder holds `fragment.swc` (what happened to each frame, the graph of keyframes), `keyframes.swc` (the keyframes
+themselves) and `map-K.swc` for each submap K, all in the format of checkpoints (docs/checkpoints.md).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+
+from scanweld.arrays import Float64, Int64
+from scanweld.checkup.first_look import FirstLook
+from scanweld.datasets.base import RgbdSequence
+from scanweld.datasets.selection import select
+from scanweld.errors import FileFormatError
+from scanweld.loop_closure.loop_closer import KeyframeLoopCloser
+from scanweld.loop_closure.place_recognition import KeyframeDatabase
+from scanweld.loop_closure.search import Edge
+from scanweld.mapping.mapper import SurfelMapper
+from scanweld.parallel import limited_threads
+from scanweld.runs.checkpoint import encoding, file
+from scanweld.runs.checkpoint.identity import identity_of
+from scanweld.runs.summary import peak_rss_mb
+from scanweld.runs.walk import Tally, process_all
+from scanweld.slam.config import SlamConfig
+from scanweld.slam.frame_log import FrameLog
+from scanweld.slam.parts import Part
+from scanweld.slam.system import build_slam
+from scanweld.slam.warmup import compile_kernels
+from scanweld.state import Stateful
+
+OpenSequence = Callable[[], RgbdSequence]
+"""Opens a recording; on another process, too, so that it must be what `pickle` can send: a function with arguments."""
+
+FRAGMENT, KEYFRAMES = "fragment.swc", "keyframes.swc"
+
+
+class Fragment(Stateful):
+    """What the whole run has to know of a fragment: little, whatever its length.
+
+    Attributes
+    ----------
+    frames : what happened to each frame, in the worlds of the fragment's submaps
+    keyframe_frames : (K,) frame of each keyframe, counted from the first of the fragment
+    T_world_keyframe : (K, 4, 4)
+    submaps : (K,) of each keyframe
+    edges : between keyframes
+    num_closures, num_joins : loops closed, and submaps joined
+    num_points_input : valid depth pixels
+    median_depth_m : of the first frame with depth
+    warnings : what the run warned of
+    peak_rss_mb : memory of the process that made it
+    """
+
+    STATE: ClassVar = {
+        "frames": Stateful, "keyframe_frames": Int64, "T_world_keyframe": Float64, "submaps": Int64,
+        "edges": list[Edge], "num_closures": int, "num_joins": int, "num_points_input": int, "median_depth_m": float,
+        "warnings": list[str], "peak_rss_mb": float | None,
+    }  # fmt: skip
+
+    def __init__(self) -> None:
+        self.frames = FrameLog()
+        self.keyframe_frames: Int64 = np.empty(0, np.int64)
+        self.T_world_keyframe: Float64 = np.empty((0, 4, 4))
+        self.submaps: Int64 = np.empty(0, np.int64)
+        self.edges: list[Edge] = []
+        self.num_closures = self.num_joins = self.num_points_input = 0
+        self.median_depth_m = 0.0
+        self.warnings: list[str] = []
+        self.peak_rss_mb: float | None = None
+
+    def restored(self) -> None:
+        """Check that all is of the same keyframes."""
+        count = len(self.keyframe_frames)
+        right = self.T_world_keyframe.shape == (count, 4, 4) and self.submaps.shape == (count,)
+        if not right or not all(0 <= k < count for edge in self.edges for k in (edge.i, edge.j)):
+            raise ValueError("keyframes that are not there")
+
+
+@dataclass(frozen=True, slots=True)
+class Workplace:
+    """Where fragments are kept, and how they are made.
+
+    Attributes
+    ----------
+    folder : on a disk that all workers share
+    config : of the run
+    threads : of each task
+    """
+
+    folder: Path
+    config: SlamConfig
+    threads: int = 1
+
+    def folder_of(self, part: int) -> Path:
+        """Return the folder of a fragment."""
+        return self.folder / f"fragment-{part:04d}"
+
+
+def make_fragment(place: Workplace, open_sequence: OpenSequence, part: Part) -> int:
+    """Track and fuse a part of a recording, and write what comes of it; returns the part's number.
+
+    A fragment that is there already, of the same frames, configuration and program, is left as it is.
+    """
+    sequence = select(open_sequence(), slice(part.start, part.stop))
+    folder, header = place.folder_of(part.index), identity_of(sequence, place.config, None)
+    if _is_there(folder, header):
+        return part.index
+    folder.mkdir(parents=True, exist_ok=True)
+    with limited_threads(place.threads):
+        compile_kernels(lambda _: None)
+        slam, tally = build_slam(sequence.camera, place.config), Tally()
+        look = FirstLook(sequence) if part.index == 0 else None
+        process_all(slam, sequence, tally, None, lambda *_: None, look=look)
+        slam.finish()
+        made, closer = Fragment(), slam.loop_closer
+        made.frames = slam.results
+        database = KeyframeDatabase(place.config.loop_closing.places)
+        if isinstance(closer, KeyframeLoopCloser):
+            database, made.submaps, made.edges = closer.database, closer.submaps, closer.edges
+        made.keyframe_frames = np.array([keyframe.frame_index for keyframe in database.keyframes], np.int64)
+        made.T_world_keyframe = np.array([k.T_world_camera for k in database.keyframes]).reshape(-1, 4, 4)
+        made.num_closures, made.num_joins = slam.num_closures, slam.num_joins
+        made.num_points_input, made.median_depth_m = tally.num_points_input, tally.median_depth_m
+        made.warnings = [f"{part}: {warning}" for warning in tally.warnings]
+        for submap, surfels in slam.maps.items():
+            _write(folder / f"map-{submap}.swc", header, surfels)
+        _write(folder / KEYFRAMES, header, database)
+        made.peak_rss_mb = peak_rss_mb()
+        _write(folder / FRAGMENT, header, made)  # last: where it is, all is
+    return part.index
+
+
+def read_fragment(place: Workplace, part: int) -> Fragment:
+    """Return what the whole run has to know of a fragment."""
+    fragment = Fragment()
+    _read(place.folder_of(part) / FRAGMENT, fragment)
+    return fragment
+
+
+def read_keyframes(place: Workplace, part: int) -> KeyframeDatabase:
+    """Return the keyframes of a fragment, in its own worlds."""
+    database = KeyframeDatabase(place.config.loop_closing.places)
+    _read(place.folder_of(part) / KEYFRAMES, database)
+    return database
+
+
+def read_map(place: Workplace, part: int, submap: int) -> SurfelMapper:
+    """Return the map of a submap of a fragment, and what shows it."""
+    mapper = SurfelMapper(place.config.fusion, place.config.map)
+    _read(place.folder_of(part) / f"map-{submap}.swc", mapper.map)
+    return mapper
+
+
+def _is_there(folder: Path, header: Mapping[str, Any]) -> bool:
+    try:
+        with file.CheckpointFile(folder / FRAGMENT) as stored:
+            return stored.header == header
+    except FileFormatError:
+        return False
+
+
+def _write(path: Path, header: Mapping[str, Any], state: Stateful) -> None:
+    file.write(path, header, encoding.encode(state, Stateful))
+
+
+def _read(path: Path, state: Stateful) -> None:
+    with file.CheckpointFile(path) as stored:
+        try:
+            encoding.restore(stored, state)
+        except (ValueError, IndexError, TypeError, OverflowError, MemoryError) as error:
+            raise FileFormatError(f"{path}: is no part of a fragment ({error})") from None

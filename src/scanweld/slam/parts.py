@@ -1,0 +1,67 @@
+"""How a recording is cut into fragments: parts that overlap, so that neighbours have seen the same frames."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+from scanweld.config import check_ranges, setting
+from scanweld.errors import InvalidInputError
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FragmentConfig:
+    """How a recording is cut into fragments."""
+
+    overlap: int = setting(
+        60,
+        "frames that two neighbouring fragments share; raise where the camera moves slowly or is lost at a seam, costs "
+        "time: they are tracked twice",
+        low=4,
+    )
+
+    def __post_init__(self) -> None:
+        check_ranges(self)
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """Frames start..stop - 1 of a recording.
+
+    Attributes
+    ----------
+    index : of the part
+    start, stop : frames
+    """
+
+    index: int
+    start: int
+    stop: int
+
+    def __len__(self) -> int:
+        return self.stop - self.start
+
+    def __str__(self) -> str:
+        return f"fragment {self.index} (frames {self.start} to {self.stop - 1})"
+
+
+def parts_of(num_frames: int, number: int, overlap: int) -> list[Part]:
+    """Cut a recording into so many parts of equal length; each shares frames with its neighbours and no others.
+
+    Raises
+    ------
+    InvalidInputError
+        When there are too few frames for so many parts.
+    """
+    if number < 1:
+        raise InvalidInputError(f"fragments: expected at least 1, got {number}")
+    if number == 1:
+        return [Part(0, 0, num_frames)]
+    most = (num_frames - overlap) // (2 * overlap)
+    if number > most:
+        raise InvalidInputError(
+            f"fragments: {num_frames} frames make at most {max(most, 1)} fragments that share {overlap} frames with "
+            f"each neighbour and have as many of their own, got {number}; lower fragments.overlap, or the number"
+        )
+    starts = [(num_frames - overlap) * k // number for k in range(number + 1)]
+    return [Part(k, start, after + overlap) for k, (start, after) in enumerate(pairwise(starts))]
