@@ -126,14 +126,27 @@ class Linker:
         return placed
 
     def _aligned(self, moving: Fragment, still: Fragment, j: int, start: Place) -> Place | None:
-        """Align a keyframe with a map of another fragment; None where there is no map, or it does not fit."""
+        """Align a keyframe with a map of another fragment; None where there is no map, or it does not fit.
+
+        It is aligned with its own map in the same way, and the difference is what counts: so the errors that the image
+        of a keyframe has, and those of a pose that was found when its map was young, are in both, and drop out.
+        """
         if _nearest_keyframe(still, start)[1] > APART:
             return None
-        pyramid = moving.database[j].pyramid(self._surfaces)
-        view = still.map_of(start.submap).view(start.T_world_camera, pyramid.frame.camera)
+        keyframe = moving.database[j]
+        pyramid = keyframe.pyramid(self._surfaces)
+        there = self._tracked(pyramid, still, start)
+        own = Place(int(moving.submaps[j]), keyframe.T_world_camera)
+        here = None if there is None else self._tracked(pyramid, moving, own)
+        if there is None or here is None:
+            return None
+        return Place(start.submap, there @ se3.inverse(here) @ keyframe.T_world_camera)
+
+    def _tracked(self, pyramid: SurfacePyramid, fragment: Fragment, start: Place) -> Float64 | None:
+        view = fragment.map_of(start.submap).view(start.T_world_camera, pyramid.frame.camera)
         found = self.aligner.track(pyramid, view, start.T_world_camera)
         off = views_apart(se3.inverse(start.T_world_camera) @ found.T_target_source)
-        return Place(start.submap, found.T_target_source) if found.status.success and off < _MOST_OFF else None
+        return found.T_target_source if found.status.success and off < _MOST_OFF else None
 
     def _recognise(self, moving: Fragment, still: Fragment, placed: dict[int, Place]) -> None:
         """Look for keyframes that are not placed among those of the other fragment, and go on from where they are."""
