@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -64,3 +64,9 @@ class InMemory(WrappedSequence):
         depth, color = self.frames[index]
         depth_m = depth.astype(np.float32) / np.float32(5000)
         return sw.Frame(float(self.timestamps_s[index]), depth_m, color, self.camera)
+
+
+@lru_cache(maxsize=1)
+def rendered_walk(config: sw.RenderConfig, frames: int) -> Laps:
+    """Return a walk by what it is rendered from: any process can open it, and keeps one round of it in memory."""
+    return Laps(InMemory(sw.SyntheticSequence(config)), frames)
