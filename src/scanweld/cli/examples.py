@@ -15,6 +15,7 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
         ("scanweld slam desk --out run", "map a recording"),
         ("scanweld slam desk.r3d --frames 100:400 --scale 0.5", "a part, half the size"),
         ("scanweld slam desk --set surfaces.max_depth_m=4", "change one setting"),
+        ("scanweld slam building --fragments 8", "a long one, in 8 parts at a time"),
     ),
     "register": (
         ("scanweld register a.ply b.ply --plot pair.png", "align two scans, and look"),

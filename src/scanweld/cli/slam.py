@@ -16,6 +16,7 @@ from scanweld.cli.view import HOST, PORT, opened_observers
 
 if TYPE_CHECKING:
     from scanweld.datasets.base import RgbdSequence
+    from scanweld.runs.input import RunInput
     from scanweld.runs.run import RunSummary
     from scanweld.slam.config import SlamConfig
 
@@ -66,6 +67,19 @@ def slam(
     rerun: Annotated[
         str | None, Option(help="Record the run for Rerun, or show it there.", metavar="F.rrd|live|URL")
     ] = None,
+    fragments: Annotated[
+        int | None,
+        Option(
+            help="Cut a long recording into so many overlapping parts, run these in processes, and join them.", min=1
+        ),
+    ] = None,
+    scheduler: Annotated[
+        str | None, Option(help="Run fragments on the workers of a Dask scheduler.", metavar="tcp://HOST:8786")
+    ] = None,
+    workers: Annotated[
+        int | None,
+        Option(help="Processes that run fragments. Default: one per core.", min=1),
+    ] = None,
     force: Annotated[bool, Option("--force", help="Replace an existing run.")] = False,
     json_output: Annotated[bool, Option("--json", help="Print the metrics as one JSON object.")] = False,
 ) -> int:
@@ -79,6 +93,15 @@ def slam(
     from scanweld.runs.input import RunInput, collected_warnings
     from scanweld.runs.reopen import given_poses
 
+    if fragments is None and (scheduler is not None or workers is not None):
+        raise typer.BadParameter("--scheduler and --workers are for --fragments N")
+    alone = {
+        "--poses": poses, "--calibrate": calibrate, "--refine": refine, "--realtime": realtime, "--view": view,
+        "--rerun": rerun, "--checkpoint-every": checkpoint_every,
+    }  # fmt: skip
+    refused = [name for name, value in alone.items() if value not in (None, False)]
+    if fragments is not None and refused:
+        raise typer.BadParameter(f"--fragments: a run in fragments takes no {refused[0]}")
     settings = load_config(config, overrides or [])
     source = RunInput(str(sequence), format_name, frames, scale, camera, depth_scale, topics)
     with collected_warnings() as warnings:
@@ -92,6 +115,12 @@ def slam(
         **source.described(), "poses": poses_from, "config": str(config) if config else None, "set": overrides or [],
         "warnings": warnings,
     }  # fmt: skip
+    if fragments is not None:
+        summary = run_in_fragments(
+            source, settings, folder, fragments, scheduler=scheduler, workers=workers, threads=threads, force=force,
+            resume=resume, tracked_only=tracked_only, description=description, started=started,
+        )  # fmt: skip
+        return print_summary(summary, json_output=json_output)
     with opened_observers(opened.name, view=view, host=view_host, port=view_port, rerun=rerun) as observers:
         summary = run_with_progress(
             opened, settings, folder, force=force, poses=given, threads=threads, tracked_only=tracked_only,
@@ -143,6 +172,46 @@ def run_with_progress(
     with FrameProgress(len(sequence) or None, title, then) as progress:
         compile_kernels(lambda part: progress.say(f"compiling, once for this machine: {part}"))
         return run_sequence(sequence, config, out=folder, progress=progress.update, started=started, **options)
+
+
+def run_in_fragments(
+    source: RunInput,
+    config: SlamConfig,
+    folder: Path,
+    number: int,
+    *,
+    scheduler: str | None,
+    workers: int | None,
+    threads: int | None,
+    **options: Any,
+) -> RunSummary:
+    """Run a sequence in fragments with progress on standard error."""
+    from scanweld.cli.progress import CountProgress
+    from scanweld.cluster.executors import opened_executor
+    from scanweld.runs.folder import check_writable
+    from scanweld.runs.fragments.run import run_fragments
+    from scanweld.slam.warmup import compile_kernels
+
+    check_writable(folder, force=options["force"])
+    with CountProgress("fragments") as progress:
+        compile_kernels(lambda part: progress.begin(f"compiling, once for this machine: {part}"))
+
+        def told(what: str, done: int, total: int) -> None:
+            if done == 0:
+                progress.begin(what)
+            progress.update(done, total)
+
+        with opened_executor(scheduler, workers=workers) as executor:
+            return run_fragments(
+                source.open,
+                number,
+                config,
+                out=folder,
+                executor=executor,
+                threads=threads or 1,
+                progress=told,
+                **options,
+            )
 
 
 def print_summary(summary: RunSummary, *, json_output: bool) -> int:

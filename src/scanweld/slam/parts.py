@@ -32,11 +32,13 @@ class Part:
     ----------
     index : of the part
     start, stop : frames
+    shared : so many of the first are in the part before, too
     """
 
     index: int
     start: int
     stop: int
+    shared: int
 
     def __len__(self) -> int:
         return self.stop - self.start
@@ -56,7 +58,7 @@ def parts_of(num_frames: int, number: int, overlap: int) -> list[Part]:
     if number < 1:
         raise InvalidInputError(f"fragments: expected at least 1, got {number}")
     if number == 1:
-        return [Part(0, 0, num_frames)]
+        return [Part(0, 0, num_frames, 0)]
     most = (num_frames - overlap) // (2 * overlap)
     if number > most:
         raise InvalidInputError(
@@ -64,4 +66,4 @@ def parts_of(num_frames: int, number: int, overlap: int) -> list[Part]:
             f"each neighbour and have as many of their own, got {number}; lower fragments.overlap, or the number"
         )
     starts = [(num_frames - overlap) * k // number for k in range(number + 1)]
-    return [Part(k, start, after + overlap) for k, (start, after) in enumerate(pairwise(starts))]
+    return [Part(k, start, after + overlap, overlap if k else 0) for k, (start, after) in enumerate(pairwise(starts))]

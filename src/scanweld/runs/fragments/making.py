@@ -18,6 +18,7 @@ from scanweld.checkup.first_look import FirstLook
 from scanweld.datasets.base import RgbdSequence
 from scanweld.datasets.selection import select
 from scanweld.errors import FileFormatError
+from scanweld.geometry.frame import Frame
 from scanweld.loop_closure.loop_closer import KeyframeLoopCloser
 from scanweld.loop_closure.place_recognition import KeyframeDatabase
 from scanweld.loop_closure.search import Edge
@@ -33,6 +34,7 @@ from scanweld.slam.parts import Part
 from scanweld.slam.system import build_slam
 from scanweld.slam.warmup import compile_kernels
 from scanweld.state import Stateful
+from scanweld.trajectory import FrameResult
 
 OpenSequence = Callable[[], RgbdSequence]
 """Opens a recording; on another process, too, so that it must be what `pickle` can send: a function with arguments."""
@@ -51,7 +53,7 @@ class Fragment(Stateful):
     submaps : (K,) of each keyframe
     edges : between keyframes
     num_closures, num_joins : loops closed, and submaps joined
-    num_points_input : valid depth pixels
+    num_points_input : valid depth pixels, without the frames that the part before has, too
     median_depth_m : of the first frame with depth
     warnings : what the run warned of
     peak_rss_mb : memory of the process that made it
@@ -116,9 +118,14 @@ def make_fragment(place: Workplace, open_sequence: OpenSequence, part: Part) -> 
         compile_kernels(lambda _: None)
         slam, tally = build_slam(sequence.camera, place.config), Tally()
         look = FirstLook(sequence) if part.index == 0 else None
-        process_all(slam, sequence, tally, None, lambda *_: None, look=look)
-        slam.finish()
         made, closer = Fragment(), slam.loop_closer
+
+        def count(_: object, frame: Frame | None, result: FrameResult) -> None:
+            if frame is not None and result.index >= part.shared:
+                made.num_points_input += int(np.count_nonzero(frame.depth_m))
+
+        process_all(slam, sequence, tally, None, count, look=look)
+        slam.finish()
         made.frames = slam.results
         database = KeyframeDatabase(place.config.loop_closing.places)
         if isinstance(closer, KeyframeLoopCloser):
@@ -126,7 +133,7 @@ def make_fragment(place: Workplace, open_sequence: OpenSequence, part: Part) -> 
         made.keyframe_frames = np.array([keyframe.frame_index for keyframe in database.keyframes], np.int64)
         made.T_world_keyframe = np.array([k.T_world_camera for k in database.keyframes]).reshape(-1, 4, 4)
         made.num_closures, made.num_joins = slam.num_closures, slam.num_joins
-        made.num_points_input, made.median_depth_m = tally.num_points_input, tally.median_depth_m
+        made.median_depth_m = tally.median_depth_m
         made.warnings = [f"{part}: {warning}" for warning in tally.warnings]
         for submap, surfels in slam.maps.items():
             _write(folder / f"map-{submap}.swc", header, surfels)

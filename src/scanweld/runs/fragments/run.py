@@ -7,13 +7,13 @@ import shutil
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Executor, Future, ThreadPoolExecutor, as_completed
+from concurrent.futures import BrokenExecutor, Executor, Future, ThreadPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
 
 from scanweld.datasets.base import LiveSequence, RgbdSequence
 from scanweld.datasets.images import explain_unusable_depth
-from scanweld.errors import DatasetError, InvalidInputError
+from scanweld.errors import DatasetError, InvalidInputError, OutputError
 from scanweld.runs.checkpoint.identity import fingerprint_of
 from scanweld.runs.folder import check_writable, write_folder
 from scanweld.runs.fragments.assembling import Assembly, assemble
@@ -170,6 +170,8 @@ class _Tasks:
                 future.result()
                 self._progress(what, done, len(tasks))
                 yield tasks[future]
+        except BrokenExecutor as error:
+            raise OutputError(f"{what}: a worker was lost ({error}); was there enough memory?") from None
         finally:
             for future in tasks:
                 future.cancel()
