@@ -10,7 +10,7 @@ from scanweld.evaluation.doubled_surfaces import doubled_surfaces
 from scanweld.geometry.views import MapCorrection
 from scanweld.mapping.fusion import FusionConfig
 from scanweld.mapping.mapper import SurfelMapper
-from scanweld.mapping.merging import MergingConfig, merge_doubled, thin_crowded
+from scanweld.mapping.merging import MergingConfig, merge_doubled, merge_maps, thin_crowded
 from scanweld.mapping.surfel_map import SurfelMap
 
 SPACING = 0.01
@@ -251,3 +251,25 @@ class TestThinCrowded:
         assert thin_crowded(surfels, 100.0) == 0
         surfels.pages.follow(surfels.capacity)
         assert thin_crowded(surfels, 100.0) > 0
+
+
+class TestMaps:
+    def test_surface_that_two_maps_have_is_kept_once(self) -> None:
+        """Layers 1 cm apart of equal confidence: what stays lies half-way; what one map alone has is left."""
+        surfels = SurfelMap()
+        add(surfels, wall(40), anchor=0)
+        add(surfels, wall(40, 0.01, seed=1)[:, :800], anchor=1)  # over a half of the other one
+        gone = merge_maps(surfels, 100.0)
+        assert gone == 1600 + 800 - len(surfels)
+        assert 1600 <= len(surfels) < 1.03 * 1600
+        heights = surfels.positions_m[2]
+        inner = (surfels.positions_m[1] > 0.03) & (surfels.positions_m[1] < 0.16)
+        assert np.median(heights[inner]) == pytest.approx(0.005, abs=0.001)
+        assert heights[surfels.positions_m[1] > 0.25].max() == 0
+
+    def test_one_map_is_left_as_it_is(self) -> None:
+        surfels = SurfelMap()
+        add(surfels, np.concatenate([wall(20), wall(20, 0.01)], axis=1), anchor=3)
+        assert merge_maps(surfels, 100.0) == 0
+        assert merge_maps(surfels, 100.0, MergingConfig(distance_m=0.0)) == 0
+        assert len(surfels) == 800

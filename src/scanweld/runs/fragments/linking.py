@@ -24,13 +24,13 @@ def link_fragments(place: Workplace, a: Part, b: Part) -> list[Edge]:
     """
     config = place.config.loop_closing
     with limited_threads(place.threads):
-        notes = [read_fragment(place, part.index) for part in (a, b)]
-        if any(len(note.keyframe_frames) == 0 for note in notes):
+        first, second = read_fragment(place, a.index), read_fragment(place, b.index)
+        if not (len(first.submaps) and len(second.submaps)):
             return []
-        sides = [_known(place, part, note) for part, note in zip((a, b), notes, strict=True)]
         linker = Linker(FrameToModelTracker(place.config.tracking), config)
-        loops = linker.link(*sides, _seen_by_both(a, b, *notes))
-    return [*_seams(a, b, *notes, config.drift), *loops]
+        seen = _seen_by_both(a, b, first, second)
+        loops = linker.link(_known(place, a, first), _known(place, b, second), seen)
+    return [*_seams(a, b, first, second, config.drift), *loops]
 
 
 def _known(place: Workplace, part: Part, note: Fragment) -> linking.Fragment:

@@ -232,8 +232,8 @@ def _described(
 def _work_folder(out: Path | None, *, resume: bool) -> Iterator[Path]:
     """Yield a folder for what tasks hand to each other; after an error it stays, for `resume`."""
     if out is None:
-        with tempfile.TemporaryDirectory(prefix="scanweld-fragments-") as folder:
-            yield Path(folder)
+        with tempfile.TemporaryDirectory(prefix="scanweld-fragments-") as temporary:
+            yield Path(temporary)
         return
     folder = out.resolve().with_name(out.name + ENDING)
     if not resume:
