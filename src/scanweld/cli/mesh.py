@@ -80,6 +80,7 @@ def mesh(
         return 0
     source = f"{made.num_frames} frames" if made.num_frames else "surfels"
     typer.echo(f"mesh     {len(made.mesh):,} triangles, {made.mesh.area_m2:.1f} m2")
-    typer.echo(f"from     {source}, voxel {made.voxel_m * 1e3:g} mm, grid of {made.memory_mb:.0f} MB, {made.seconds:.1f} s")
+    grid = f"voxel {made.voxel_m * 1e3:g} mm, grid of {made.memory_mb:.0f} MB"
+    typer.echo(f"from     {source}, {grid}, {made.seconds:.1f} s")
     typer.echo(f"written  {made.path}")
     return 0

@@ -62,15 +62,15 @@ def write_run(
     started: float,
 ) -> None:
     """Write every file of a run into an empty folder; metrics["seconds_total"] is brought up to date."""
-    trajectory = outcome.trajectory
+    trajectory, surfels = outcome.trajectory, outcome.map
     (folder / "config.toml").write_text(to_toml(config), encoding="utf-8")
     write_tum(folder / "trajectory.txt", trajectory_of(outcome.main_results, tracked_only=tracked_only))
-    write_ply(folder / "map.ply", outcome.map)
+    write_ply(folder / "map.ply", surfels)
     write_submaps(folder, outcome)
     write_frames(folder / "frames.csv", outcome.results)
     side_by_side(
         lambda: write_plots(folder / "plots", outcome.results, trajectory, error, sequence.name),
-        lambda: write_renders(folder / "renders", outcome.map, trajectory, sequence.camera),
+        lambda: write_renders(folder / "renders", surfels, trajectory, sequence.camera),
     )
     if sequence.ground_truth is not None:
         write_tum(folder / "groundtruth.txt", sequence.ground_truth)
