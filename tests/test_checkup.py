@@ -14,18 +14,21 @@ import pytest
 
 import scanweld as sw
 from rendered import MemorySequence, rendered
-from scanweld.checkup.evidence import plan_bursts
+from scanweld.checkup.evidence import Pair, plan_bursts
 from scanweld.checkup.examine import examine, examine_input
 from scanweld.checkup.findings import FIGURES, WHY, Level
 from scanweld.checkup.first_look import FirstLook
+from scanweld.checkup.motions import Motion, check_focal_length, check_truth
 from scanweld.checkup.pictures import edge_spread
 from scanweld.checkup.repeats import check_repeats
 from scanweld.checkup.times import check_times
 from scanweld.cli.app import run
 from scanweld.datasets.synthetic.spoiling import SPOILS, spoil
 from scanweld.errors import ConfigError, DatasetError
+from scanweld.geometry import se3
 
 SIZE = {"width": 160, "height": 120}
+CAMERA = sw.PinholeCamera(260.0, 260.0, 159.5, 119.5, 320, 240)
 
 
 @lru_cache(maxsize=2)
@@ -126,6 +129,45 @@ def test_truth_of_another_clock_and_of_other_axes() -> None:
     (finding,) = examine(replace(sequence, ground_truth=turned)).findings
     assert finding.fault == "truth"
     assert "OpenGL" in finding.seen
+
+
+def views_of(points_m: np.ndarray, factor: float = 1.0, num: int = 6) -> list[Pair]:
+    """Views of points (N, 3), two metres ahead, from both sides, as a lens `factor` times too long takes them."""
+    rng, pairs, lens = np.random.default_rng(3), [], np.array([1 / factor, 1 / factor, 1.0])
+    for k in range(num):
+        T = se3.exp([0.2, 0, 0, 0, 0, 0]) @ se3.exp([0, 0, 0, 0, 0.08 + 0.01 * k, 0.03])
+        sides = [
+            side + 0.01 * rng.standard_normal(side.shape) for side in (points_m, se3.transform_points(T, points_m))
+        ]
+        pairs.append(Pair(0.0, 1.0, sides[0] * lens, sides[1] * lens, np.full(len(points_m), 0.02)))
+    return pairs
+
+
+@pytest.mark.parametrize(("factor", "expected"), [(1.0, 1.0), (1.3, 1 / 1.3), (0.75, 1 / 0.75)])
+def test_focal_length_that_makes_one_rigid_thing(factor: float, expected: float) -> None:
+    room = np.random.default_rng(0).uniform([-1, -0.8, 1.2], [1, 0.8, 3.5], (300, 3))
+    findings, figures = check_focal_length(CAMERA, CAMERA, views_of(room, factor))
+    assert [finding.fault for finding in findings] == ([] if factor == 1 else ["intrinsics"])
+    assert figures["focal_factor"] == pytest.approx(expected, rel=0.04)
+
+
+def test_a_wall_fits_with_any_focal_length() -> None:
+    """Lengths on it shrink alike in all views, and so do the errors of its features: that makes no lens better."""
+    wall = np.random.default_rng(0).uniform([-1, -0.8, 2.0], [1, 0.8, 2.0], (300, 3))
+    assert check_focal_length(CAMERA, CAMERA, views_of(wall))[0] == []
+
+
+def test_truth_on_a_wall_is_told_by_what_moves() -> None:
+    """A shift of 6 cm and a turn of 0.03 rad all but undo each other at two metres: features tell them apart badly."""
+    true = np.stack([se3.exp([0.1 * k, 0, 0, 0, 0, 0]) for k in range(5)])
+    truth = sw.Trajectory(np.arange(5.0), true)
+    wrong = se3.exp([0.06, 0, 0, 0, -0.03, 0])
+    motions = [Motion(k, k + 1.0, wrong @ se3.inverse(true[k + 1]) @ true[k]) for k in range(4)]
+    findings, figures = check_truth(truth, truth.timestamps_s, motions, 2.0, 1000.0)
+    assert findings == []
+    assert figures["truth_disagreement"] < 0.35
+    backwards = [Motion(m.source_s, m.target_s, se3.inverse(m.T_target_source)) for m in motions]
+    assert [f.fault for f in check_truth(truth, truth.timestamps_s, backwards, 2.0, 1000.0)[0]] == ["truth-inverted"]
 
 
 def test_intrinsics_of_another_image_size() -> None:
