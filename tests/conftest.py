@@ -10,6 +10,9 @@ import pytest
 
 # Compiling a kernel on first use is slow and is no failure of a property.
 hypothesis.settings.register_profile("scanweld", deadline=None, derandomize=True, max_examples=50)
+hypothesis.settings.register_profile(
+    "few", hypothesis.settings.get_profile("scanweld"), max_examples=3
+)  # scripts/coverage
 hypothesis.settings.load_profile("scanweld")
 
 

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from scanweld.errors import InvalidInputError
 from scanweld.geometry.camera import PinholeCamera
+from scanweld.geometry.frame import Frame
 
 CAMERA = PinholeCamera(525, 520, 319.5, 239.5, 640, 480)
 
@@ -129,3 +130,21 @@ def test_what_does_not_fit() -> None:
         CAMERA.scaled(0.0001)
     with pytest.raises(InvalidInputError, match="depth has shape"):
         CAMERA.back_project(np.zeros((3, 4), np.float32))
+
+
+class TestFrame:
+    @pytest.mark.parametrize(
+        ("depth_m", "color", "words"),
+        [
+            (np.ones((4, 6)), None, "depth_m must be float32"),
+            (np.ones((6, 4), np.float32), None, r"depth has shape \(6, 4\), the camera \(4, 6\)"),
+            (np.full((4, 6), -1, np.float32), None, "finite and not negative, got -1"),
+            (np.full((4, 6), np.nan, np.float32), None, "finite and not negative, got nan"),
+            (np.full((4, 6), np.inf, np.float32), None, "set invalid pixels to 0"),
+            (np.ones((4, 6), np.float32), np.zeros((4, 6), np.uint8), r"color must be \(H, W, 3\) uint8"),
+            (np.ones((4, 6), np.float32), np.zeros((4, 6, 3), np.float32), "float32"),
+        ],
+    )
+    def test_what_is_no_frame_is_refused(self, depth_m: np.ndarray, color: np.ndarray | None, words: str) -> None:
+        with pytest.raises(InvalidInputError, match=words):
+            Frame(0.0, depth_m, color, PinholeCamera(5.0, 5.0, 2.5, 1.5, 6, 4))

@@ -12,6 +12,7 @@ import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -21,7 +22,7 @@ import scanweld as sw
 from rendered import blind, pose_error, rendered, write_tum_folder
 from scanweld.cli import app as command_line
 from scanweld.cli import progress
-from scanweld.cli.slam import load_config, slam
+from scanweld.cli.slam import load_config, slam, summary_text
 from scanweld.config import load_toml
 from scanweld.errors import ConfigError
 from scanweld.parallel import get_num_threads, set_num_threads
@@ -545,3 +546,25 @@ def test_colour_that_is_missing_is_no_error(scanweld: Callable[..., Answer], tmp
     assert "Traceback" not in err
     if code == 0:
         assert files_of(Path("run")) == FILES
+
+
+def test_summary_of_a_run_that_is_one_in_every_way() -> None:
+    """What was not joined, and the words of refinement and calibration; no line where there are no truth and time."""
+    metrics: dict[str, object] = dict.fromkeys(METRICS) | {
+        "frames": 90, "frames_tracked": 80, "frames_lost": 9, "frames_unreadable": 1, "num_surfels": 12_345,
+        "num_points_input": 67_890, "path_length_m": 1.234, "submaps_unjoined": 2, "frames_in_unjoined_submaps": 7,
+    }  # fmt: skip
+    camera = sw.PinholeCamera(500.0, 501.0, 320.0, 240.0, 640, 480)
+    poses = SimpleNamespace(sigmas={}, held=(), note="keyframes moved by 3 mm")
+    found = SimpleNamespace(sigmas={"fx": 0.1}, held=(), recalibrated=True, camera=camera, note="0.1 px")
+    same = SimpleNamespace(sigmas={}, held=("fx",), recalibrated=False, camera=camera, note="not determined")
+    summary = SimpleNamespace(metrics=metrics, refinements=[poses, found, same], folder=None, resumable=False)
+    assert summary_text(summary).splitlines() == [  # type: ignore[arg-type]
+        "frames   80 of 90 tracked, 9 lost, 1 unreadable",
+        "map      12,345 surfels from 67,890 points",
+        "path     1.23 m",
+        "apart    2 submaps with 7 frames, counted as lost: no place in common with the map was found",
+        "refined  keyframes moved by 3 mm",
+        "camera   fx 500.00 fy 501.00 cx 320.00 cy 240.00; 0.1 px",
+        "camera   as given; not determined",
+    ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -43,6 +44,16 @@ def room(count: int, seed: int, noise: float = 0.0) -> np.ndarray:
     ball = [2, 1.5, 0.5] + 0.5 * ball / np.linalg.norm(ball, axis=1, keepdims=True)
     points[face == 6] = ball[face == 6]
     return points + noise * rng.normal(size=points.shape)
+
+
+def yard(T_world_sensor: np.ndarray) -> np.ndarray:
+    """What a spinning scanner of 32 rings sees in a yard of 16 x 12 m with high walls, exactly."""
+    elevation, azimuth = np.radians(np.linspace(-25, 10, 32)), np.linspace(0.001, 2 * np.pi, 300, endpoint=False)
+    e, a = np.meshgrid(elevation, azimuth)
+    rays = np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)], axis=-1).reshape(-1, 3)
+    (x, y, z), (ox, oy, oz) = T_world_sensor[:3, :3] @ rays.T, T_world_sensor[:3, 3]
+    walls = np.minimum((np.sign(x) * 8 - ox) / x, (np.sign(y) * 6 - oy) / y)
+    return rays * np.minimum(walls, np.where(z < 0, -oz / np.where(z < 0, z, -1), np.inf))[:, None]
 
 
 def outline(count: int, seed: int, noise: float = 0.0) -> np.ndarray:
@@ -1067,3 +1078,34 @@ class TestUncertainty:
         # Gauss-Newton leaves out r times the second derivative, which residuals of 5 mm and of the sampling make.
         tolerance = 0.05 if method == "point-to-point" else 0.02
         np.testing.assert_allclose(result.information, hessian, atol=tolerance * np.abs(hessian).max())
+
+
+def test_clouds_of_uneven_density_are_first_aligned_by_even_points(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Points of the floor lie in rings about the scanner wherever it stands, and pair up as if it had not moved."""
+    before, after = se3.exp([0, 0, 1.8, 0, 0, 0]), se3.exp([1.0, 0.5, 1.8, 0, 0, 0.1])
+    target, source = yard(before), yard(after)
+    config = IcpConfig(method="point-to-point", max_correspondence_distance_m=2.0)
+    monkeypatch.setattr("scanweld.geometry.neighbours.kd_tree._UNEVEN", 0.0)  # every cloud is uneven
+    errors = {}
+    for coarse in (True, False):
+        result = icp(source, target, config=replace(config, coarse_to_fine=coarse))
+        errors[coarse] = np.linalg.norm((se3.inverse(se3.inverse(before) @ after) @ result.T_target_source)[:3, 3])
+    assert errors[True] < 0.02
+    assert errors[True] < errors[False] / 3
+
+
+def test_a_prior_is_a_transform_and_what_is_known_of_it() -> None:
+    for T, information, words in (
+        (np.eye(3), np.eye(6), r"expected a transform \(4, 4\), got \(3, 3\)"),
+        (np.eye(4), np.eye(3), r"expected a finite information matrix \(6, 6\), got \(3, 3\)"),
+        (np.eye(4), np.full((6, 6), np.inf), "finite"),
+        (np.eye(4), -np.eye(6), "positive semidefinite"),
+        (np.eye(4), np.triu(np.ones((6, 6))), "symmetric"),
+    ):
+        with pytest.raises(InvalidInputError, match=words):
+            MotionPrior(T, information)
+    for sigma in (0.0, -1.0, np.nan):
+        with pytest.raises(InvalidInputError, match="standard deviations must be positive"):
+            MotionPrior.from_deviations(np.eye(4), translation_m=sigma, rotation_rad=1.0)
+    prior = MotionPrior.from_deviations(np.eye(4), translation_m=[0.5, np.inf, 1], rotation_rad=0.1)
+    np.testing.assert_allclose(np.diag(prior.information), [4, 0, 1, 100, 100, 100])

@@ -219,6 +219,51 @@ def two_frames() -> list[tuple[sw.Frame, np.ndarray]]:
     return [(sequence.frames[i], sequence.ground_truth.T_world_camera[i]) for i in (0, 8)]
 
 
+def test_a_grid_that_grows_is_the_one_that_had_room(
+    two_frames: list[tuple[sw.Frame, np.ndarray]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reference = mesh_from_frames(two_frames, voxel_m=0.02)
+    monkeypatch.setattr("scanweld.meshing.volume._FIRST_BLOCKS", 16)
+    mesh = mesh_from_frames(two_frames, voxel_m=0.02)
+    for name in ("vertices_m", "triangles", "normals", "colors"):
+        assert getattr(mesh, name).tobytes() == getattr(reference, name).tobytes()
+
+
+def test_pieces_are_kept_where_all_of_them_are_small(caplog: pytest.LogCaptureFixture) -> None:
+    frames = [(wall_frame(1.0), np.eye(4))]
+    mesh = mesh_from_frames(frames, voxel_m=0.02, config=MeshConfig(least_component=10**6))
+    assert len(mesh) == len(mesh_from_frames(frames, voxel_m=0.02, config=ALL)) > 0
+    assert "the mesh is all pieces of fewer than 1000000 triangles" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"vertices_m": np.zeros((4, 2))}, r"expected vertices \(N, 3\) and triangles \(M, 3\), got \(4, 2\)"),
+        ({"triangles": np.zeros((2, 4))}, r"got \(4, 3\) and \(2, 4\)"),
+        ({"triangles": np.array([[0, 1, 4]])}, r"a triangle names a vertex outside 0\.\.3"),
+        ({"triangles": np.array([[-1, 1, 2]])}, "a triangle names a vertex outside"),
+        ({"normals": np.zeros((3, 3))}, r"normals: expected \(4, 3\) float32, got \(3, 3\)"),
+        ({"colors": np.zeros((4, 3))}, r"colors: expected \(4, 3\) uint8, got \(4, 3\) float64"),
+    ],
+)
+def test_what_is_no_mesh_is_refused(changes: dict[str, np.ndarray], words: str) -> None:
+    with pytest.raises(InvalidInputError, match=words):
+        TriangleMesh(**{"vertices_m": np.eye(4, 3), "triangles": np.array([[0, 1, 2]]), **changes})
+
+
+def test_a_moved_mesh_keeps_its_triangles(tetrahedron: TriangleMesh) -> None:
+    """A quarter turn about z, and 1 m along x: (x, y, z) becomes (1 - y, x, z), and normals turn alone."""
+    T = np.array([[0, -1, 0, 1], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]])
+    moved = tetrahedron.transformed(T)
+    x, y, z = tetrahedron.vertices_m.T
+    np.testing.assert_allclose(moved.vertices_m, np.stack([1 - y, x, z], axis=1), atol=1e-6)
+    nx, ny, nz = tetrahedron.normals.T
+    np.testing.assert_allclose(moved.normals, np.stack([-ny, nx, nz], axis=1), atol=1e-6)
+    np.testing.assert_array_equal(moved.triangles, tetrahedron.triangles)
+    np.testing.assert_array_equal(moved.colors, tetrahedron.colors)
+
+
 def test_grid_takes_no_more_memory_than_it_may(two_frames: list[tuple[sw.Frame, np.ndarray]]) -> None:
     volume = TsdfVolume(0.004, MeshConfig(max_memory_mb=16))
     with pytest.raises(GridTooLargeError, match=r"more than 16 MB at a voxel of 0\.004 m; raise the voxel"):
@@ -487,6 +532,24 @@ def test_command_line(finished_run: Path, tmp_path: Path, capsys: pytest.Capture
     count = PlyData.read(str(tmp_path / "splats.ply"))["vertex"].count
     assert count > 1000
     assert f"splats   {count:,}\n" in capsys.readouterr().out
+    options = ["--splat", "--json", "--out", str(tmp_path / "splats.ply")]
+    assert run_command(["mesh", str(finished_run), *options]) == 0
+    assert json.loads(capsys.readouterr().out)["splats"] == count
+    options = [
+        "--depth-max",
+        "2.5",
+        "--memory",
+        "400",
+        "--threads",
+        "1",
+        "--voxel",
+        "0.05",
+        "--out",
+        str(out),
+        "--json",
+    ]
+    assert run_command(["mesh", str(finished_run), *options]) == 0
+    assert 0 < json.loads(capsys.readouterr().out)["triangles"] < figures["triangles"]  # of what is near
     assert run_command(["mesh", str(finished_run), "--out", str(tmp_path / "mesh.stl")]) == 1
     assert "known: PLY, OBJ, GLB" in capsys.readouterr().err
 

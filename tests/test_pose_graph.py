@@ -490,6 +490,23 @@ def test_the_graph_is_left_alone_and_the_answer_has_the_same_bytes():
 # --- alignments as edges ---------------------------------------------------------------------------------------------
 
 
+def test_an_alignment_in_the_plane_is_no_edge():
+    result = RegistrationResult(T_target_source=np.eye(3), status=Status.CONVERGED, information=np.eye(3))
+    with pytest.raises(InvalidInputError, match=r"expected an alignment in 3-D, got information \(3, 3\)"):
+        edge_information(result)
+
+
+def test_information_that_is_negative_along_no_axis_is_refused_all_the_same():
+    """Correlations of 0.9, 0.9 and -0.9 between three things: possible two by two, not all three; 1 - 2 * 0.9 < 0."""
+    information = np.eye(6)
+    information[:3, :3] = [[1, 0.9, 0.9], [0.9, 1, -0.9], [0.9, -0.9, 1]]
+    graph = PoseGraph()
+    graph.add_node(np.eye(4))
+    graph.add_node(np.eye(4))
+    with pytest.raises(InvalidInputError, match="symmetric and positive semidefinite"):
+        graph.add_edge(0, 1, np.eye(4), information)
+
+
 def test_an_alignment_becomes_an_edge_as_it_is():
     """chi-square of an edge whose measurement is off by exp(xi) from the left is xi^T C^-1 xi."""
     rng = np.random.default_rng(0)

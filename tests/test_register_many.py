@@ -361,6 +361,28 @@ def test_components_are_solved_together():
     np.testing.assert_allclose(covariance[2], np.diag(SIGMA**2), atol=1e-12)
 
 
+def test_first_guesses_spare_the_search():
+    """Poses that are off by 5 cm and a degree: each pair starts there, and ends at the truth."""
+    clouds, poses = scans_around(3, half_angle=2.0)
+    guesses = poses @ se3.exp(np.array([0.03, -0.03, 0.02, 0.01, -0.01, 0.01]))
+    result = register_many(clouds, T_init=guesses)
+    assert result.status is Status.CONVERGED
+    translation_m, rotation_rad = errors(result, poses, range(3))
+    assert translation_m < 0.01
+    assert rotation_rad < 0.005
+
+
+def test_an_alignment_that_leaves_a_motion_free_makes_the_whole_degenerate():
+    clouds, poses = scans_around(2)
+    known = KnownPairs(clouds, poses)
+
+    def align(source, target, T_init):
+        result = known(source, target, T_init)
+        return replace(result, covariance=np.diag([0.0, *SIGMA[1:] ** 2]))
+
+    assert register_many(clouds, align=align).status is Status.DEGENERATE
+
+
 def test_what_the_caller_got_wrong_is_said():
     clouds, _ = scans_around()
     with pytest.raises(InvalidInputError, match="at least two scans"):

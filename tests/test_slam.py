@@ -195,6 +195,12 @@ class TestGivenPoses:
         assert map_bytes(slam.map) == before
         assert len(slam.results) == 1
 
+    def test_poses_far_from_the_origin_are_refused(self) -> None:
+        T = np.eye(4)
+        T[1, 3] = -2e4
+        with pytest.raises(sw.InvalidInputError, match="20000 m from the origin, expected at most 10000 m"):
+            sw.build_slam(CAMERA, T_world_first=T)
+
     def test_the_callers_pose_is_copied(self) -> None:
         pose = np.eye(4)
         slam = sw.build_slam(CAMERA)

@@ -206,6 +206,34 @@ class TestTwins:
         assert pose_error(joins[0].T_kept_joined, np.diag([-1.0, 1.0, -1.0, 1.0]))[1] < 3
 
 
+class TestOneMap:
+    """Stages that know nothing of submaps."""
+
+    class Mapper:
+        """A mapper of one map."""
+
+        def __init__(self) -> None:
+            self.inner = sw.SurfelMapper()
+            self.map, self.view, self.fuse, self.apply = (
+                self.inner.map, self.inner.view, self.inner.fuse, self.inner.apply,
+            )  # fmt: skip
+
+    def test_they_begin_none(self) -> None:
+        pyramid = sw.build_pyramid(rendered(count=40).frames[0])
+        for mapper, closer in ((self.Mapper(), KeyframeLoopCloser()), (sw.SurfelMapper(), sw.NoLoopCloser())):
+            atlas = Atlas(mapper, closer)
+            assert atlas.begin(pyramid, 3) is None
+            assert list(atlas.mappers) == [0]
+
+    def test_a_state_with_several_maps_is_not_theirs(self) -> None:
+        atlas = Atlas(self.Mapper(), KeyframeLoopCloser())
+        with pytest.raises(ValueError, match="a mapper of one map has several"):
+            atlas.submaps = [0, 1]
+        atlas.active = 3
+        with pytest.raises(ValueError, match="submap 3, which is not there"):
+            atlas.restored()
+
+
 class TestEvidence:
     @staticmethod
     def pair(i: int, j: int, T_i_j: np.ndarray) -> PlacePair:
