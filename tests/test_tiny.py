@@ -18,16 +18,20 @@ from rendered import frame_of, plane_depth, pose_error
 from scanweld.geometry import se3
 from scanweld.geometry.neighbours import KdTree
 from scanweld.geometry.neighbours.grid import HashGrid
+from scanweld.geometry.normals import estimate_normals
 from scanweld.geometry.views import MapCorrection
 from scanweld.loop_closure.loop_closer import KeyframeLoopCloser
 from scanweld.mapping.rendering import render_picture
 from scanweld.mapping.storage.pages import MapConfig
 from scanweld.meshing.config import MeshConfig
+from scanweld.meshing.extraction import extract_mesh
 from scanweld.meshing.fuse import mesh_from_frames
 from scanweld.meshing.rendering import render_mesh
+from scanweld.meshing.volume import TsdfVolume
 from scanweld.refinement.config import RefinementConfig
 from scanweld.registration.local.config import METHODS
 from scanweld.registration.robust_pairs import align_pairs_robustly
+from scanweld.tracking import kernels as tracking_kernels
 from scanweld.tracking.dynamics import DynamicsConfig
 
 CAMERA = sw.PinholeCamera(32.8, 32.8, 19.5, 14.5, 40, 30)
@@ -89,8 +93,8 @@ def test_a_map_beyond_memory_is_the_same() -> None:
         np.testing.assert_array_equal(column, maps[1][name])
 
 
-def test_what_moves_is_left_out() -> None:
-    """A board before a wall goes 10 cm to the right with each frame."""
+def test_a_board_that_passes_does_not_carry_the_camera_off() -> None:
+    """A board before a wall and its steps goes to the right, 3 pixels a frame."""
     slam = sw.Slam(
         tracker=sw.FrameToModelTracker(), mapper=sw.SurfelMapper(), loop_closer=sw.NoLoopCloser(),
         dynamics=DynamicsConfig(),
@@ -106,6 +110,65 @@ def test_what_moves_is_left_out() -> None:
         if result.state is sw.FrameState.TRACKING:
             assert pose_error(result.T_world_camera, np.eye(4))[0] < 0.05
     assert slam.results[0].state is sw.FrameState.TRACKING
+
+
+def test_regions_grow_from_their_seeds() -> None:
+    """A wall 1 m away, whose columns from 6 on are at 2 m; pixels are 1 cm wide there, and growth ends after 2.5 cm.
+
+    From the square of four seeds the pixels up to two steps away: 8 are one step away, 12 are two, but two of these lie
+    on the farther wall. A seed alone is noise where two are asked for.
+    """
+    surface = np.zeros((9, 12, 8), np.float32)
+    surface[..., 2] = np.where(np.arange(12) < 6, 1, 2)
+    surface[..., 5], surface[..., 6] = -1, 500
+    state = np.full((9, 12), tracking_kernels.OPEN, np.uint8)
+    state[3:5, 3:5] = state[0, 9] = tracking_kernels.SEED
+    moving, queue, distance = np.zeros((9, 12), np.bool_), np.empty(108, np.int32), np.empty((9, 12), np.float32)
+    limits = (np.float32(0.01), np.float32(0.02), np.float32(4.0), np.float32(0.5), 2, np.float32(0.025))
+    assert tracking_kernels.grow_regions(surface, state, *limits, queue, distance, moving) == 22
+    rows, columns = np.indices((9, 12))
+    steps = np.maximum(3 - rows, rows - 4).clip(0) + np.maximum(3 - columns, columns - 4).clip(0)
+    np.testing.assert_array_equal(moving, (steps <= 2) & (columns < 6))
+    assert state[0, 9] == tracking_kernels.CLOSED
+
+
+def test_a_mask_is_refined_by_depth() -> None:
+    """Of four coarse pixels the first moves: it and the next are four fine ones, of which one is at another depth."""
+    depth = np.ones((1, 8), np.float32)
+    depth[0, 1] = 1.5
+    mask = np.empty((1, 8), np.bool_)
+    coarse = np.array([[True, False, False, False]])
+    tracking_kernels.refine_rows(0, 1, depth, coarse, np.ones((1, 4), np.float32), 2, np.float32(0.02), mask)
+    np.testing.assert_array_equal(mask, [[True, False, True, True, False, False, False, False]])
+
+
+@pytest.mark.parametrize("radius", [1, 2, 3])
+def test_normals_of_a_wall_are_its_own(radius: int) -> None:
+    normal = np.array([0.2, -0.1, 1]) / np.linalg.norm([0.2, -0.1, 1])
+    frame = frame_of(plane_depth(normal, 1.5, CAMERA), camera=CAMERA)
+    level = sw.build_pyramid(frame, sw.SurfaceConfig(normal_radius=radius)).levels[0]
+    valid = level.surface[..., 6] > 0
+    assert valid.mean() > 0.5
+    np.testing.assert_allclose(level.normals[valid] @ normal, -1, atol=1e-3)
+
+
+def test_normals_of_a_cloud_are_its_own() -> None:
+    x, y = np.random.default_rng(0).uniform(0, 1, (2, 600))
+    normals = estimate_normals(np.stack([x, y, 0.3 * x - 0.2 * y], axis=1), neighbours=8)
+    np.testing.assert_allclose(np.abs(normals @ [-0.3, 0.2, 1]) / np.linalg.norm([-0.3, 0.2, 1]), 1, atol=1e-6)
+
+
+def test_surfels_become_a_mesh() -> None:
+    """A disc of surfels 2 cm apart, in the plane z = 1."""
+    x, y = (side.ravel() for side in np.meshgrid(np.arange(-7, 8) * 0.02, np.arange(-7, 8) * 0.02))
+    surfels = {"x": x, "y": y, "z": np.ones(225), "nx": 0 * x, "ny": 0 * x, "nz": -np.ones(225),
+               "radius": np.full(225, 0.015), "confidence": np.full(225, 10.0)}  # fmt: skip
+    surfels |= {name: np.full(225, 90, np.uint8) for name in ("red", "green", "blue")}
+    volume = TsdfVolume(0.05)
+    volume.integrate_surfels(surfels)
+    mesh = extract_mesh(volume)
+    assert len(mesh) > 20
+    assert np.abs(mesh.vertices_m[:, 2] - 1).max() < 0.02
 
 
 def test_a_place_is_known_again() -> None:

@@ -68,10 +68,10 @@ def march_blocks(
                             case |= (1 << c) if d[x, y, z] < 0 else 0
                         if (not known) | (case == 0) | (case == 255):
                             continue
-                        size = cases[case, 0]
+                        size = int(cases[case, 0])
                         near = True
                         for t in range(1, 1 + size):
-                            c, axis = cases[case, t] // 3, cases[case, t] % 3
+                            c, axis = divmod(int(cases[case, t]), 3)
                             x, y, z = i + (c & 1), j + ((c >> 1) & 1), k + ((c >> 2) & 1)
                             beyond = d[x + (axis == 0), y + (axis == 1), z + (axis == 2)]
                             near &= min(d[x, y, z], beyond) >= -limit
@@ -79,7 +79,7 @@ def march_blocks(
                             continue
                         if write:
                             for t in range(size):
-                                c, axis = cases[case, 1 + t] // 3, cases[case, 1 + t] % 3
+                                c, axis = divmod(int(cases[case, 1 + t]), 3)
                                 x, y, z = i + (c & 1), j + ((c >> 1) & 1), k + ((c >> 2) & 1)
                                 owner = around[(x >> 3) | ((y >> 3) << 1) | ((z >> 3) << 2)]
                                 at = ((x & 7) * SIDE + (y & 7)) * SIDE + (z & 7)
