@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from itertools import combinations
 from typing import Any
@@ -32,9 +33,19 @@ from scanweld.arrays import Float64, Int64, as_transforms
 from scanweld.config import check_ranges, setting
 from scanweld.errors import InvalidInputError
 from scanweld.geometry import se3
-from scanweld.geometry.foreign import as_cloud
-from scanweld.geometry.point_cloud import PointCloud, voxel_downsample
+from scanweld.geometry.point_cloud import PointCloud
 from scanweld.parallel import limited_threads
+from scanweld.registration.pair_tasks import (
+    LEAST_POINTS,
+    Aligner,
+    Distributed,
+    InProcess,
+    PairAligner,
+    PairTasks,
+    Scan,
+    ScanFacts,
+    align_by_default,
+)
 from scanweld.registration.pose_graph import PoseGraphConfig, edge_information
 from scanweld.registration.result import RegistrationResult, Status
 from scanweld.registration.scan_graph import (
@@ -52,13 +63,7 @@ __all__ = ["ManyConfig", "ManyResult", "ScanPair", "register_many"]
 
 _log = logging.getLogger(__name__)
 
-PairAligner = Callable[[Any, Any, Float64 | None], RegistrationResult]
-"""Aligns a prepared source to a prepared target, from a guess of T_target_source where there is one."""
-
-_LEAST_POINTS = 10
 _DOF = 6
-_RADII_PER_VOXEL = 0.05  # of the samples that tell the overlap
-_VOXELS_PER_GATE = 1.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -148,42 +153,47 @@ class ManyResult:
 
 
 def register_many(
-    clouds: Sequence[npt.ArrayLike | PointCloud],
+    clouds: Sequence[Scan],
     *,
     T_init: npt.ArrayLike | None = None,
     config: ManyConfig | None = None,
     align: PairAligner | None = None,
     prepare: Callable[[PointCloud], Any] | None = None,
     num_threads: int | None = None,
+    executor: Executor | None = None,
 ) -> ManyResult:
     """Find the poses of scans that overlap in part, whichever do.
 
     Parameters
     ----------
-    clouds : N scans, each (M, 3) points [m] or a cloud; rows that are not finite are left out
+    clouds : N scans, each (M, 3) points [m], a cloud, a file, or a function that returns one of these; rows that are
+        not finite are left out
     T_init : (N, 4, 4) guesses of T_world_scan; None where nothing is known
     config : see :class:`ManyConfig`
     align : what aligns a pair; :func:`~scanweld.registration.global_registration.register_global`, and GICP where
         there is a guess, when None
     prepare : what is done once with each scan before; `align` gets what it returns
     num_threads : all cores when None; the result does not depend on it
+    executor : where pairs are aligned, each in a task of its own that is handed the two scans as they were given: with
+        files or functions no process has all scans in memory, this one none at all. `align` and `prepare` must then be
+        what `pickle` can send. In this process when None; the result does not depend on it
 
     Raises
     ------
     InvalidInputError
         When there are fewer than two scans, one is not 3-D, or `T_init` does not fit.
+    FileFormatError
+        When a file cannot be read.
     """
-    scans = [as_cloud(cloud, f"scan {k}").finite() for k, cloud in enumerate(clouds)]
-    if len(scans) < 2:
-        raise InvalidInputError(f"clouds: expected at least two scans, got {len(scans)}")
-    for k, scan in enumerate(scans):
-        if scan.dimension != 3:
-            raise InvalidInputError(f"scan {k}: expected points in 3-D, got {scan.dimension}-D")
-    guesses = None if T_init is None else _as_guesses(T_init, len(scans))
-    if align is None:
-        align, prepare = _default_aligner()
+    if len(clouds) < 2:
+        raise InvalidInputError(f"clouds: expected at least two scans, got {len(clouds)}")
+    guesses = None if T_init is None else _as_guesses(T_init, len(clouds))
+    aligner = Aligner(align, prepare) if align is not None else Aligner(align_by_default)
     with limited_threads(num_threads):
-        work = _Work(scans, config or ManyConfig(), align, prepare)
+        tasks: PairTasks = (
+            InProcess(clouds, aligner) if executor is None else Distributed(clouds, aligner, executor, num_threads)
+        )
+        work = _Work(tasks, config or ManyConfig())
         work.try_pairs(_candidates(work, guesses), guesses)
         state = work.solve()
         for _ in range(work.config.rounds):
@@ -200,21 +210,6 @@ def _as_guesses(T_init: npt.ArrayLike, count: int) -> Float64:
     if guesses.shape != (count, 4, 4):
         raise InvalidInputError(f"T_init: expected shape ({count}, 4, 4), got {guesses.shape}")
     return as_transforms(guesses, "T_init")
-
-
-def _default_aligner() -> tuple[PairAligner, Callable[[PointCloud], Any] | None]:
-    from scanweld.registration.global_registration import register_global
-    from scanweld.registration.icp import IcpConfig, icp
-
-    def align(source: PointCloud, target: PointCloud, T_init: Float64 | None) -> RegistrationResult:
-        if T_init is not None:
-            near = icp(source, target, T_init=T_init, config=IcpConfig(method="gicp"))
-            if near.status.success:
-                return near
-        result: RegistrationResult = register_global(source, target)
-        return result
-
-    return align, None
 
 
 @dataclass(frozen=True, slots=True)
@@ -244,28 +239,19 @@ class _State:
 
 
 class _Work:
-    """The scans, prepared once, and the alignments so far."""
+    """What is known of the scans, and the alignments so far."""
 
-    def __init__(
-        self,
-        scans: list[PointCloud],
-        config: ManyConfig,
-        align: PairAligner,
-        prepare: Callable[[PointCloud], Any] | None,
-    ) -> None:
-        self.scans, self.config, self.align = scans, config, align
-        self.enough = [len(scan) >= _LEAST_POINTS for scan in scans]
-        self.prepared = [
-            (prepare(scan) if prepare else scan) if ok else None for scan, ok in zip(scans, self.enough, strict=True)
-        ]
+    def __init__(self, tasks: PairTasks, config: ManyConfig) -> None:
+        self.tasks, self.config = tasks, config
+        self.scans = tasks.describe()
+        self.enough = [scan.num_points >= LEAST_POINTS for scan in self.scans]
         self.results: dict[tuple[int, int], RegistrationResult] = {}
-        self._samples: dict[int, tuple[Float64, cKDTree, float]] = {}
+        self._trees: dict[int, cKDTree] = {}
 
     def try_pairs(self, pairs: list[tuple[int, int]], poses: Float64 | None) -> None:
         """Align pairs (target, source), from where `poses` put them if given."""
-        for i, j in pairs:
-            guess = None if poses is None else se3.inverse(poses[i]) @ poses[j]
-            result = self.align(self.prepared[j], self.prepared[i], guess)
+        guesses = [None if poses is None else se3.inverse(poses[i]) @ poses[j] for i, j in pairs]
+        for (i, j), result in zip(pairs, self.tasks.align(pairs, guesses), strict=True):
             _log.debug("scans %d and %d: %s, overlap %.2f", i, j, result.status.value, result.overlap)
             self.results[i, j] = result
 
@@ -279,17 +265,20 @@ class _Work:
 
     def _overlap(self, i: int, j: int, poses: Float64) -> float:
         """Share of the points of i that are near one of j, or the other way round if that is more."""
-        for k in (i, j):
-            if k not in self._samples:
-                self._samples[k] = _sample(self.scans[k])
-        (a, tree_a, gate_a), (b, tree_b, gate_b) = self._samples[i], self._samples[j]
-        gate = max(gate_a, gate_b)
-        T = se3.inverse(poses[i]) @ poses[j]
+        a, b = self.scans[i], self.scans[j]
+        gate, T = max(a.gate_m, b.gate_m), se3.inverse(poses[i]) @ poses[j]
+        if np.linalg.norm(se3.transform_points(T, b.centroid_m) - a.centroid_m) > a.reach_m + b.reach_m + gate:
+            return 0.0
         shares = [
-            np.isfinite(tree.query(se3.transform_points(motion, points), distance_upper_bound=gate)[0]).mean()
-            for tree, motion, points in ((tree_a, T, b), (tree_b, se3.inverse(T), a))
+            np.isfinite(self._tree(k).query(se3.transform_points(motion, points), distance_upper_bound=gate)[0]).mean()
+            for k, motion, points in ((i, T, b.sample_m), (j, se3.inverse(T), a.sample_m))
         ]
         return float(max(shares))
+
+    def _tree(self, k: int) -> cKDTree:
+        if k not in self._trees:
+            self._trees[k] = cKDTree(self.scans[k].sample_m)
+        return self._trees[k]
 
     def solve(self) -> _State:
         """Find out which alignments agree, and the poses that they give."""
@@ -321,17 +310,16 @@ class _Work:
             np.array([result.overlap * np.sqrt(result.num_inliers) for result in results]),
         )
 
-    def _information(self, result: RegistrationResult, target: PointCloud) -> Float64:
+    def _information(self, result: RegistrationResult, target: ScanFacts) -> Float64:
         """Information of an edge, whose standard deviations are no smaller than the noise allows.
 
         The floor is a shift of `noise_share` rmse at the target's centroid, and a turn about it that moves the points
         as much.
         """
-        centroid = target.points_m.mean(axis=0)
-        radius = float(np.sqrt(((target.points_m - centroid) ** 2).sum(axis=1).mean()))
+        radius = target.radius_m
         floor = max(self.config.noise_share * result.rmse_m, 1e-4 * radius)
         place = np.eye(4)
-        place[:3, 3] = centroid
+        place[:3, 3] = target.centroid_m
         at_centroid = se3.adjoint(place)
         information = edge_information(result, min_sigma_m=floor)
         turned = at_centroid.T @ information @ at_centroid  # twists about the centroid are Ad times those at the origin
@@ -351,14 +339,6 @@ def _candidates(work: _Work, guesses: Float64 | None) -> list[tuple[int, int]]:
     if len(work.scans) <= work.config.all_pairs_up_to:
         return pairs
     return [(i, j) for i, j in pairs if j - i <= work.config.window]
-
-
-def _sample(scan: PointCloud) -> tuple[Float64, cKDTree, float]:
-    """Return a thinned scan, its tree, and how near a point must be to lie on it [m]."""
-    radius = float(np.median(np.linalg.norm(scan.points_m - np.median(scan.points_m, axis=0), axis=1)))
-    voxel = max(_RADII_PER_VOXEL * radius, 1e-9)
-    points = voxel_downsample(PointCloud(scan.points_m), voxel).points_m
-    return points, cKDTree(points), _VOXELS_PER_GATE * voxel
 
 
 def _result(work: _Work, state: _State) -> ManyResult:
