@@ -99,19 +99,20 @@ class Linker:
         ----------
         seen : keyframes of `b` whose frames `a` has seen, too, each with where that was in `a`
         """
-        placed = self._spread(b, a, seen)
+        placed: dict[int, Place] = {}
+        self._spread(b, a, seen, placed)
         self._recognise(b, a, placed)
         mirrored = dict(_seen_from(a, b, j, place) for j, place in placed.items())
+        back: dict[int, Place] = {}
+        self._spread(a, b, mirrored, back)
         edges = [self._edge(i, j, T) for i, j, T in _nearest(a, _evenly(placed))]
-        back = _nearest(b, _evenly(self._spread(a, b, mirrored)))
-        return edges + [self._edge(i, j, se3.inverse(T)) for j, i, T in back]
+        return edges + [self._edge(i, j, se3.inverse(T)) for j, i, T in _nearest(b, _evenly(back))]
 
     def _edge(self, i: int, j: int, T_i_j: Float64) -> Edge:
         return tracked_edge(i, j, T_i_j, self.config.drift, loop=True)
 
-    def _spread(self, moving: Fragment, still: Fragment, seeds: Mapping[int, Place]) -> dict[int, Place]:
-        """Align keyframes of one fragment with the maps of another, from seeds on to their neighbours."""
-        placed: dict[int, Place] = {}
+    def _spread(self, moving: Fragment, still: Fragment, seeds: Mapping[int, Place], placed: dict[int, Place]) -> None:
+        """Align keyframes of one fragment with the maps of another, from seeds on to their neighbours; adds them."""
         count = len(moving.database)
         for order in (range(count), range(count - 1, -1, -1)):
             last: int | None = None
@@ -123,7 +124,6 @@ class Linker:
                         continue
                     placed[j] = place
                 last = j
-        return placed
 
     def _aligned(self, moving: Fragment, still: Fragment, j: int, start: Place) -> Place | None:
         """Align a keyframe with a map of another fragment; None where there is no map, or it does not fit.
@@ -170,8 +170,7 @@ class Linker:
                 if join is None:
                     continue
                 seeds = {p.j - first: Place(submaps[p.i], keyframes[p.i].T_world_camera @ p.T_i_j) for p in join.pairs}
-                for k, place in self._spread(moving, still, seeds).items():
-                    placed.setdefault(k, place)
+                self._spread(moving, still, seeds, placed)
                 break
 
     @property
