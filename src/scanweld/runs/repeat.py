@@ -19,6 +19,7 @@ from scanweld.errors import DatasetError, InvalidInputError
 from scanweld.runs.checkpoint.identity import fingerprint_of
 from scanweld.runs.comparison import Comparison, compare_runs, differences_of_fingerprints
 from scanweld.runs.folder import MARK
+from scanweld.runs.fragments.run import run_fragments
 from scanweld.runs.reopen import given_poses, read_description, reopen_input
 from scanweld.runs.run import Progress, poses_by_frame, run_sequence
 from scanweld.slam.config import SlamConfig
@@ -65,6 +66,15 @@ def repeat_run(
         sequence = stack.enter_context(_input_of(run))
         poses = given_poses(sequence, str(run["poses"])) if run.get("poses") else None
         _check_input(sequence, None if poses is None else poses_by_frame(sequence, poses), run, folder)
+        description = {**{key: run[key] for key in INPUT if key in run}, "repeats": str(folder.resolve())}
+        tracked_only = bool(run.get("tracked_only"))
+        if isinstance(run.get("fragments"), Mapping):
+            number = len(run["fragments"]["parts"])
+            run_fragments(
+                lambda: sequence, number, config, out=out, force=force, tracked_only=tracked_only,
+                description=description,
+            )  # fmt: skip
+            return compare_runs(out, folder)
         summary = run_sequence(
             sequence,
             config,
@@ -74,9 +84,9 @@ def repeat_run(
             progress=progress,
             calibrate=bool(run.get("calibrate")),
             refine=bool(run.get("refine")),
-            tracked_only=bool(run.get("tracked_only")),
+            tracked_only=tracked_only,
             checkpoint_every_s=0.0,
-            description={**{key: run[key] for key in INPUT if key in run}, "repeats": str(folder.resolve())},
+            description=description,
         )
         if summary.interrupted:
             raise KeyboardInterrupt
