@@ -22,6 +22,8 @@ OPTIONS = {
     "slam": "--out --format --camera --depth-scale --frames --scale --poses --config --set --threads --force --json "
     "--tracked-only --topics --refine --calibrate --realtime --resume --checkpoint-every --view --view-host "
     "--view-port --rerun",
+    "batch": "--out --scheduler --workers --sweep --set --config --format --topics --camera --depth-scale --frames "
+    "--scale --threads --memory --retries --checkpoint-every --force --json",
     "register": "--method --scale --init --global --voxel --max-distance --set --threads --explain --plot --out --json",
     "evaluate": "--align --json --plot",
     "render": "--out --scene --path --path-frame --noise --frames --size --fps --spoil --seed --force",

@@ -15,6 +15,7 @@ from typing import Annotated, Any
 
 import typer
 
+from scanweld.cli.batch import batch
 from scanweld.cli.bench import bench
 from scanweld.cli.check import check
 from scanweld.cli.completion import completion
@@ -65,6 +66,7 @@ for command in (
     demo,
     check,
     slam,
+    batch,
     register,
     evaluate,
     render,

@@ -17,6 +17,11 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
         ("scanweld slam desk --set surfaces.max_depth_m=4", "change one setting"),
         ("scanweld slam building --fragments 8", "a long one, in 8 parts at a time"),
     ),
+    "batch": (
+        ("scanweld batch recordings/* --out runs", "all of them, on all cores"),
+        ("scanweld batch a b --out runs --sweep surfaces.levels=2,3", "which is better?"),
+        ("scanweld batch s3://lab/a --out runs --scheduler tcp://head:8786", "a cluster"),
+    ),
     "register": (
         ("scanweld register a.ply b.ply --plot pair.png", "align two scans, and look"),
         ("scanweld register a.ply b.ply --global", "without a first guess"),

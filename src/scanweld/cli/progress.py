@@ -5,7 +5,9 @@ from __future__ import annotations
 import logging
 import sys
 import time
+from collections.abc import Mapping, Sequence
 from types import TracebackType
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.logging import RichHandler
@@ -13,6 +15,9 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColum
 from rich.table import Column
 
 from scanweld.trajectory import FrameResult, FrameState
+
+if TYPE_CHECKING:
+    from scanweld.cluster.outcome import Outcome
 
 QUIET_INTERVAL_S = 5.0
 """Without a terminal, a line is printed this often."""
@@ -103,6 +108,62 @@ class FrameProgress:
     ) -> None:
         self._bar.stop()
         logging.getLogger().handlers[:] = self._handlers
+
+
+class BatchProgress:
+    """Shows how many runs of a batch have ended, and how far those are that are at work (a `BatchObserver`)."""
+
+    def __init__(self, names: Sequence[str]) -> None:
+        self._names, self._spoken = names, time.perf_counter()
+        self._console = Console(stderr=True)
+        self._live = self._console.is_terminal
+        self._doing: dict[int, str] = {}
+        self._done = 0
+
+    def __enter__(self) -> BatchProgress:
+        self._bar = _bar(self._console, TextColumn("{task.fields[detail]}", markup=False))
+        self._bar.start()
+        self._task = self._bar.add_task("batch", total=len(self._names), detail="")
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.stop()
+
+    def say(self, text: str) -> None:
+        """Print one line, above the bar where there is one."""
+        if self._live:
+            self._bar.console.print(text, style="dim", markup=False, highlight=False)
+        else:
+            print(text, file=sys.stderr, flush=True)
+
+    def working(self, number: int, what: Mapping[str, Any]) -> None:
+        """Show how far a run is."""
+        self._doing[number] = str(what.get("doing") or f"{what.get('frame')}/{what.get('total')}")
+        at_work = [f"{self._names[key]} {doing}" for key, doing in sorted(self._doing.items())]
+        room = max(self._console.width - 50, 20)
+        detail = next(
+            (text for k in range(len(at_work), 0, -1) if len(text := _some(at_work, k)) <= room), _some(at_work, 0)
+        )
+        if self._live:
+            self._bar.update(self._task, detail=detail)
+        elif time.perf_counter() - self._spoken > QUIET_INTERVAL_S:
+            self._spoken = time.perf_counter()
+            print(f"batch: {self._done}/{len(self._names)} {', '.join(at_work)}", file=sys.stderr, flush=True)
+
+    def ended(self, outcome: Outcome) -> None:
+        """Say what became of a run."""
+        self._done += 1
+        self._doing.pop(outcome.number, None)
+        self._bar.update(self._task, advance=1)
+        what = outcome.verdict or outcome.state.value
+        because = f": {outcome.reason}" if outcome.reason and not outcome.good else ""
+        self.say(f"{self._done}/{len(self._names)}  {self._names[outcome.number]}  {what}{because}")
+
+
+def _some(texts: Sequence[str], count: int) -> str:
+    """The first of some texts, and how many more there are."""
+    left = len(texts) - count
+    return ", ".join([*texts[:count], *([f"{left} at work" if count == 0 else f"{left} more"] if left else [])])
 
 
 class CountProgress:

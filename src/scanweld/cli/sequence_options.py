@@ -1,4 +1,4 @@
-"""Options of all commands that open a sequence or configure SLAM, declared once."""
+"""Options that several commands have to open a sequence, or to configure and run SLAM on it."""
 
 from __future__ import annotations
 
@@ -29,4 +29,8 @@ Config = Annotated[Path | None, Option(help="Configuration file.", metavar="F.to
 Overrides = Annotated[
     list[str] | None,
     Option("--set", help="Set one value, for example tracking.stable_fraction=0.1.", autocompletion=slam_settings),
+]
+CheckpointEvery = Annotated[
+    float | None,
+    Option(help="Seconds between checkpoints, 0: on Ctrl-C only. Default: 60, or what costs 2 %.", min=0.0),
 ]

@@ -11,7 +11,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from scanweld.cli.sequence_options import Camera, Config, DepthScale, Format, Frames, Overrides, Scale, Topics
+from scanweld.cli.sequence_options import (
+    Camera,
+    CheckpointEvery,
+    Config,
+    DepthScale,
+    Format,
+    Frames,
+    Overrides,
+    Scale,
+    Topics,
+)
 from scanweld.cli.view import HOST, PORT, opened_observers
 
 if TYPE_CHECKING:
@@ -55,10 +65,7 @@ def slam(
     resume: Annotated[
         bool, Option("--resume", help="Continue a run that was interrupted or killed, from its checkpoint.")
     ] = False,
-    checkpoint_every: Annotated[
-        float | None,
-        Option(help="Seconds between checkpoints, 0: on Ctrl-C only. Default: 60, or what costs 2 %.", min=0.0),
-    ] = None,
+    checkpoint_every: CheckpointEvery = None,
     view: Annotated[bool, Option("--view", help="Show the run in the browser while it goes by.")] = False,
     view_host: Annotated[
         str, Option(help="Where --view listens; others than this machine need the token of its address.")

@@ -46,6 +46,7 @@ def connected(
     memory_limit: str | int | None = "auto",
     resources: Mapping[str, float] | None = None,
     dashboard: bool = False,
+    allowed_failures: int | None = None,
     timeout_s: float = CONNECT_S,
 ) -> Iterator[Client]:
     """Yield a client of a scheduler, and close it in the end; workers that were started for it end with it.
@@ -60,9 +61,11 @@ def connected(
     workers : number of processes to start, by default one per core and `threads_per_worker`
     threads_per_worker : tasks that a worker runs at a time
     memory_limit : of each worker, as "4GB" or in bytes; one that exceeds it is ended and started anew. "auto" shares
-        what the machine has; None sets no limit
+        what the machine has among them; None sets no limit
     resources : what each worker has to offer, by name, for tasks that ask for it
     dashboard : serve Dask's pages about what is going on, on any free port (`client.dashboard_link`); needs Bokeh
+    allowed_failures : how many workers may be lost over a task before it is given up (KilledWorker), for a scheduler
+        that is started here; by default what Dask is configured to, 3
     timeout_s : time in which the scheduler, or the first worker that is started, has to answer
 
     Raises
@@ -76,9 +79,17 @@ def connected(
     """
     distributed = load_distributed()
     if scheduler is None:
-        with _started_here(
-            distributed, workers, threads_per_worker, memory_limit, dict(resources or {}), dashboard, timeout_s
-        ) as client:
+        cluster_options = {
+            "n_workers": workers,
+            "threads_per_worker": threads_per_worker,
+            **({} if memory_limit == "auto" else {"memory_limit": memory_limit}),
+            "resources": dict(resources or {}),
+            "scheduler_kwargs": {
+                "dashboard": dashboard and find_spec("bokeh") is not None,
+                "allowed_failures": allowed_failures,
+            },
+        }
+        with _started_here(distributed, cluster_options, timeout_s) as client:
             yield client
         return
     if workers is not None:
@@ -95,28 +106,16 @@ def connected(
 
 
 @contextlib.contextmanager
-def _started_here(
-    distributed: Any,
-    workers: int | None,
-    threads_per_worker: int,
-    memory_limit: str | int | None,
-    resources: dict[str, float],
-    dashboard: bool,
-    timeout_s: float,
-) -> Iterator[Client]:
+def _started_here(distributed: Any, options: dict[str, Any], timeout_s: float) -> Iterator[Client]:
     with contextlib.ExitStack() as stack:
         stack.enter_context(_quiet())
         with _ctrl_c_ignored():
             cluster = distributed.LocalCluster(
-                n_workers=workers,
-                threads_per_worker=threads_per_worker,
-                memory_limit=memory_limit,
-                resources=resources,
                 host=LOOPBACK,
                 dashboard_address=f"{LOOPBACK}:0",
-                scheduler_kwargs={"dashboard": dashboard and find_spec("bokeh") is not None},
                 worker_dashboard_address=None,
                 silence_logs=logging.CRITICAL,
+                **options,
             )
             stack.callback(cluster.close, timeout=timeout_s)
             client = stack.enter_context(

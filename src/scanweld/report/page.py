@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import base64
-import hashlib
 import json
-import re
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from importlib.resources import files as package_files
@@ -20,6 +18,7 @@ from scanweld.config import to_toml
 from scanweld.evaluation.trajectory_metrics import AteResult
 from scanweld.geometry import se3
 from scanweld.io.atomic import write_file
+from scanweld.report.assembly import fill, policy
 from scanweld.report.charts import Chart, accuracy_charts, evaluate, tracking_charts
 from scanweld.report.run_files import RunFiles, poses_of_frames, read_run_files
 from scanweld.report.scene import display_frame, encode_scene, floats, select_points
@@ -93,10 +92,10 @@ def make_page(run: RunFiles) -> str:
     package = package_files("scanweld.report")
     style = package.joinpath("report.css").read_text(encoding="utf-8")
     script = "\n".join(package.joinpath(name).read_text(encoding="utf-8") for name in SCRIPTS)
-    return _fill(
+    return fill(
         package.joinpath("template.html").read_text(encoding="utf-8"),
         {
-            "policy": _policy(style, script),
+            "policy": policy(style, script),
             "style": style,
             "script": script,
             "data": _as_json(data),
@@ -119,23 +118,6 @@ def make_page(run: RunFiles) -> str:
             "warnings": _warnings(run.run),
             "environment": _environment(run),
         },
-    )
-
-
-def _fill(template: str, values: Mapping[str, str]) -> str:
-    """Put values into a template, each once: what a value contains is never looked at again."""
-    return re.sub(r"\{\{(\w+)\}\}", lambda match: values[match.group(1)], template)
-
-
-def _policy(style: str, script: str) -> str:
-    """Return a content security policy that allows exactly this script and this style, and no connection."""
-
-    def digest(text: str) -> str:
-        return base64.b64encode(hashlib.sha256(text.encode("utf-8")).digest()).decode("ascii")
-
-    return (
-        f"default-src 'none'; script-src 'sha256-{digest(script)}'; style-src 'sha256-{digest(style)}'; "
-        "img-src data:; base-uri 'none'; form-action 'none'"
     )
 
 

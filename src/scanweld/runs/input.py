@@ -22,7 +22,7 @@ class RunInput:
 
     Attributes
     ----------
-    input : a folder or file, or "realsense:" for a camera
+    input : a folder or file; "realsense:" for a camera; a URL of what is to be fetched before it can be opened
     format : a name of :data:`~.open.FORMATS`, or "auto"
     frames : "A:B" or "A:B:STEP", None: all
     scale : factor on the image size
@@ -58,8 +58,8 @@ class RunInput:
 
     def described(self) -> dict[str, Any]:
         """Return what run.json holds of it: the place as it is found from any other folder."""
-        place = self.input if self.input.startswith(LIVE) else str(Path(self.input).resolve())
-        return {**asdict(self), "input": place}
+        is_path = not self.input.startswith(LIVE) and "://" not in self.input
+        return {**asdict(self), "input": str(Path(self.input).resolve()) if is_path else self.input}
 
 
 @contextlib.contextmanager

@@ -62,12 +62,12 @@ def check_identity(identity: Mapping[str, Any], stored: Mapping[str, Any], where
                 f"{where}: was written by {what} {stored.get(name)!r}, this is {identity[name]!r}; resume with that "
                 "one, or begin anew with --force"
             )
-    for key, (here, there) in _differences(identity["sequence"], stored.get("sequence"), ""):
+    for key, (here, there) in differences(identity["sequence"], stored.get("sequence")):
         raise InvalidInputError(
             f"{where}: is of another sequence: {key} {_short(there)}, here {_short(here)}; resume with the same "
             "sequence and options, or begin anew with --force"
         )
-    for key, (here, there) in _differences(identity["config"], stored.get("config"), ""):
+    for key, (here, there) in differences(identity["config"], stored.get("config")):
         raise ConfigError(
             f"{where}: was made with {key} = {there!r}, here it is {here!r}; resume with the same configuration, or "
             "begin anew with --force"
@@ -103,11 +103,11 @@ def _digest(arrays: Sequence[Float64 | None] | Float64 | None) -> str | None:
     return digest.hexdigest()
 
 
-def _differences(here: Any, there: Any, key: str) -> Iterator[tuple[str, tuple[Any, Any]]]:
+def differences(here: Any, there: Any, key: str = "") -> Iterator[tuple[str, tuple[Any, Any]]]:
     """Yield the key of each value that differs, and both values."""
     if isinstance(here, Mapping) and isinstance(there, Mapping):
         for name in [*here, *(name for name in there if name not in here)]:
-            yield from _differences(here.get(name), there.get(name), f"{key}.{name}" if key else str(name))
+            yield from differences(here.get(name), there.get(name), f"{key}.{name}" if key else str(name))
     elif here != there:
         yield key, (here, there)
 
