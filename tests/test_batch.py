@@ -145,6 +145,14 @@ class TestTask:
         assert told in outcome.reason
         assert "--force replaces it" in outcome.reason
 
+    def test_links_to_folders_are_followed_but_not_round(self, desk: Path, tmp_path: Path) -> None:
+        linked = tmp_path / "linked"
+        linked.mkdir()
+        for path in desk.iterdir():
+            (linked / path.name).symlink_to(path)
+        (linked / "round").symlink_to(linked)
+        assert list_files(str(linked)).described() == list_files(str(desk)).described()
+
     def test_what_is_wrong_with_a_sequence_is_an_outcome(self, desk: Path, tmp_path: Path) -> None:
         missing = run_task(task_of(tmp_path / "nowhere", tmp_path), "b")
         assert missing.reason == f"{tmp_path / 'nowhere'}: no such folder, or an empty one"

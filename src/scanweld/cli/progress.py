@@ -118,12 +118,12 @@ class BatchProgress:
         self._console = Console(stderr=True)
         self._live = self._console.is_terminal
         self._doing: dict[int, str] = {}
-        self._done = 0
+        self._ended: set[int] = set()
 
     def __enter__(self) -> BatchProgress:
         self._bar = _bar(self._console, TextColumn("{task.fields[detail]}", markup=False))
         self._bar.start()
-        self._task = self._bar.add_task("batch", total=len(self._names), detail="")
+        self._task = self._bar.add_task("batch", total=len(self._names), detail="starting workers")
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -138,26 +138,28 @@ class BatchProgress:
 
     def working(self, number: int, what: Mapping[str, Any]) -> None:
         """Show how far a run is."""
-        self._doing[number] = str(what.get("doing") or f"{what.get('frame')}/{what.get('total')}")
-        at_work = [f"{self._names[key]} {doing}" for key, doing in sorted(self._doing.items())]
-        room = max(self._console.width - 50, 20)
-        detail = next(
-            (text for k in range(len(at_work), 0, -1) if len(text := _some(at_work, k)) <= room), _some(at_work, 0)
-        )
-        if self._live:
-            self._bar.update(self._task, detail=detail)
-        elif time.perf_counter() - self._spoken > QUIET_INTERVAL_S:
-            self._spoken = time.perf_counter()
-            print(f"batch: {self._done}/{len(self._names)} {', '.join(at_work)}", file=sys.stderr, flush=True)
+        if number not in self._ended:  # word of that may come sooner than of what was before
+            self._doing[number] = str(what.get("doing") or f"{what.get('frame')}/{what.get('total')}")
+            self._show()
 
     def ended(self, outcome: Outcome) -> None:
         """Say what became of a run."""
-        self._done += 1
+        self._ended.add(outcome.number)
         self._doing.pop(outcome.number, None)
-        self._bar.update(self._task, advance=1)
-        what = outcome.verdict or outcome.state.value
         because = f": {outcome.reason}" if outcome.reason and not outcome.good else ""
-        self.say(f"{self._done}/{len(self._names)}  {self._names[outcome.number]}  {what}{because}")
+        what = outcome.verdict or outcome.state.value
+        self.say(f"{len(self._ended)}/{len(self._names)}  {self._names[outcome.number]}  {what}{because}")
+        self._show()
+
+    def _show(self) -> None:
+        at_work = [f"{self._names[number]} {doing}" for number, doing in sorted(self._doing.items())]
+        if self._live:
+            room = max(self._console.width - 50, 20)
+            fitting = (text for k in range(len(at_work), 0, -1) if len(text := _some(at_work, k)) <= room)
+            self._bar.update(self._task, completed=len(self._ended), detail=next(fitting, _some(at_work, 0)))
+        elif time.perf_counter() - self._spoken > QUIET_INTERVAL_S:
+            self._spoken = time.perf_counter()
+            print(f"batch: {len(self._ended)}/{len(self._names)} {', '.join(at_work)}", file=sys.stderr, flush=True)
 
 
 def _some(texts: Sequence[str], count: int) -> str:

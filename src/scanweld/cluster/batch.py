@@ -224,34 +224,26 @@ class _Batch:
         return future
 
     def _end(self, future: Future) -> None:
+        """Take in what became of a task, or see that it is tried again."""
+        if future.status == "cancelled":
+            raise _SchedulerLost
         task = self.under_way.pop(future)
-        if future.status == "finished":
-            outcome = future.result()
-            if outcome.state is State.INTERRUPTED:  # its worker was about to end
+        outcome = future.result() if future.status == "finished" else self._without_result(task, future.exception())
+        if outcome.state is State.INTERRUPTED:  # its worker was lost, or was about to end
+            if task.attempt < self.options.retries:
+                self.observer.say(f"{task.name}: its worker was lost; it is tried again")
                 self.waiting.appendleft(replace(task, attempt=task.attempt + 1))
                 return
-        elif future.status == "cancelled":
-            self.under_way[future] = task
-            raise _SchedulerLost
-        else:
-            outcome = self._lost(task, future)
-        if outcome is not None:
-            self.outcomes[task.number] = outcome
-            self.observer.ended(outcome)
-
-    def _lost(self, task: RunTask, future: Future) -> Outcome | None:
-        """Try again a task whose worker was lost, up to so many times; None where it is tried again."""
-        distributed = load_distributed()
-        error = future.exception()
-        if not isinstance(error, distributed.scheduler.KilledWorker):
-            text = (str(error) or "no message").splitlines()[0]
-            return failed(task.number, f"{type(error).__name__}: {text}")
-        if task.attempt >= self.options.retries:
             lost = "its worker was lost" if task.attempt == 0 else f"its worker was lost {task.attempt + 1} times"
-            return failed(task.number, f"{lost}: killed, or out of memory")
-        self.observer.say(f"{task.name}: its worker was lost; it is tried again")
-        self.waiting.appendleft(replace(task, attempt=task.attempt + 1))
-        return None
+            outcome = failed(task.number, f"{lost}: killed, or out of memory")
+        self.outcomes[task.number] = outcome
+        self.observer.ended(outcome)
+
+    def _without_result(self, task: RunTask, error: BaseException) -> Outcome:
+        if isinstance(error, load_distributed().scheduler.KilledWorker):
+            return Outcome(task.number, State.INTERRUPTED)
+        text = (str(error) or "no message").splitlines()[0]
+        return failed(task.number, f"{type(error).__name__}: {text}")
 
     def take_back(self) -> None:
         """Put what was under way back in its place."""

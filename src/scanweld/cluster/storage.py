@@ -100,7 +100,12 @@ def _local_sizes(place: Path) -> dict[str, int]:
     if place.is_file():
         return {"": place.stat().st_size}
     found = {}
-    for folder, folders, files in os.walk(place):
+    seen: set[str] = set()
+    for folder, folders, files in os.walk(place, followlinks=True):
+        if (real := os.path.realpath(folder)) in seen:  # a link to a folder above
+            folders.clear()
+            continue
+        seen.add(real)
         folders[:] = [name for name in folders if not name.startswith(".")]
         for path in (Path(folder) / name for name in files):
             with contextlib.suppress(OSError):  # a link that leads nowhere
