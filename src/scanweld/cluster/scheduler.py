@@ -113,7 +113,7 @@ def _started_here(distributed: Any, options: dict[str, Any], timeout_s: float) -
             cluster = distributed.LocalCluster(
                 host=LOOPBACK,
                 dashboard_address=f"{LOOPBACK}:0",
-                worker_dashboard_address=None,
+                worker_dashboard_address=f"{LOOPBACK}:0",
                 silence_logs=logging.CRITICAL,
                 **options,
             )
