@@ -49,7 +49,7 @@ def page(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Page:
 
 
 def names(page: Page) -> list[str]:
-    return page.evaluate("[...document.querySelectorAll('#runs tbody tr')].map(row => row.cells[0].textContent)")
+    return page.evaluate("[...document.querySelectorAll('#runs tbody tr')].map(row => row.cells[0].dataset.v)")
 
 
 def click(page: Page, head: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import statistics
 from collections.abc import Iterator, Mapping, Sequence
 from html import escape
@@ -204,43 +205,46 @@ def _matrix_cells(found: Mapping[tuple[str, ...], Row], settings: Sequence[tuple
 
 
 def _runs(rows: Sequence[Row]) -> str:
-    has_truth = any(_number(row, "ate_rmse_m") is not None for row in rows)
-    worst = max((_number(row, "ate_rmse_m") or 0.0 for row in rows), default=0.0)
+    errors = [error for row in rows if (error := _number(row, "ate_rmse_m"))]
+    ends = (min(errors) / 2, max(errors)) if errors else None
     heads = [("Run", ""), ("Verdict", "")]
-    heads += [("ATE", "n"), ("", "bar")] if has_truth else []
+    heads += [("ATE", "n"), ("", "bar")] if ends else []
     heads += [("Tracked", "n"), ("Loops", "n"), ("Frames/s", "n"), ("Time", "n")]
     head = "".join(
         f'<th scope="col" class="{kind}">{f"<button type=button>{escape(text)}</button>" if text else ""}</th>'
         for text, kind in heads
     )
-    body = "".join(_run_row(row, worst if has_truth else None) for row in rows)
+    body = "".join(_run_row(row, ends) for row in rows)
+    about = f"Bars are logarithmic, from {length(ends[0])} to {length(ends[1])}." if ends else ""
     return (
         '<div class="scroll" tabindex="0" role="region" aria-label="Table of runs">'
         f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>"
+        f'<p class="about">{escape(about)}</p>'
     )
 
 
-def _run_row(row: Row, worst: float | None) -> str:
+def _run_row(row: Row, ends: tuple[float, float] | None) -> str:
+    """Return the row of a run; `ends` are those of the bars of errors [m]."""
     name, verdict, state = str(row["run"]), str(row["verdict"]), str(row["state"])
-    link = f'<a href="{quote(name)}/report.html">{_name(name)}</a>' if verdict else _name(name)
-    word = HEADLINES.get(verdict, state)
+    sequence, _, settings = name.partition("/")
+    link = f'<a href="{quote(name)}/report.html">{_name(sequence)}</a>' if verdict else _name(sequence)
+    link += f'<span class="why">{_name(settings)}</span>' if settings else ""
+    word = HEADLINES.get(verdict, state.capitalize())
     why = "" if verdict == TRUSTWORTHY else f'<span class="why">{escape(_reason(row))}</span>'
     kept = ' <small title="It was finished before, and was not run again">kept</small>' if state == "kept" else ""
     rank = {TRUSTWORTHY: 0, DOUBTFUL: 1, UNTRUSTWORTHY: 2}.get(verdict, 3)
     cells = [
-        f'<td class="run">{link}{kept}</td>',
+        f'<td class="run" data-v="{escape(name)}">{link}{kept}</td>',
         f'<td data-v="{rank}"><span class="chip {verdict or state}">{escape(word)}</span>{why}</td>',
     ]
     error = _number(row, "ate_rmse_m")
-    if worst is not None:
-        cells.append(_figure(error, "" if error is None else length(error)))
-        share = 0.0 if error is None or worst <= 0 else 100 * error / worst
-        cells.append(
+    if ends is not None:
+        share = 100 * math.log(error / ends[0]) / math.log(ends[1] / ends[0]) if error else 0.0
+        cells += [
+            _figure(error, "" if error is None else length(error)),
             '<td class="bar"><svg viewBox="0 0 100 10" preserveAspectRatio="none" aria-hidden="true">'
-            f'<rect class="{verdict}" width="{share:.1f}" height="10"/></svg></td>'
-            if error is not None
-            else '<td class="bar"></td>'
-        )
+            f'<rect class="{verdict}" width="{share:.1f}" height="10"/></svg></td>',
+        ]
     tracked, frames = _number(row, "frames_tracked"), _number(row, "frames")
     cells.append(_figure(tracked, "" if tracked is None else f"{tracked:,.0f} of {frames:,.0f}"))
     for key, form in (("loop_closures", "{:.0f}"), ("fps", "{:.1f}"), ("seconds_total", "{:.0f} s")):
