@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from dataclasses import replace
 from html import unescape
 from pathlib import Path
@@ -13,6 +14,8 @@ import pyarrow.parquet as pq
 import pytest
 
 import scanweld as sw
+from scanweld.cli.app import run
+from scanweld.cli.progress import BatchProgress
 from scanweld.cluster import storage
 from scanweld.cluster.batch import largest_first
 from scanweld.cluster.outcome import Outcome, State
@@ -197,9 +200,9 @@ class TestUrls:
         }
         assert {name for name in listing.sizes if name.endswith(".txt")} == local
         files, root = fsspec.core.url_to_fs(f"{out}/desk")
-        run = json.loads(files.cat_file(f"{root}/run.json"))
-        assert run["input"] == source
-        assert run["files"]["number"] == len(list_files(str(desk)).sizes)
+        noted = json.loads(files.cat_file(f"{root}/run.json"))
+        assert noted["input"] == source
+        assert noted["files"]["number"] == len(list_files(str(desk)).sizes)
         assert files.exists(f"{root}/map.ply")
         assert not files.exists(f"{root}/{storage.UPLOADING}")
         assert run_task(task_of(source, out), "b").state is State.KEPT
@@ -279,7 +282,7 @@ class TestUrls:
         assert bucket.ls("/lab/runs/desk", detail=False) == ["/lab/runs/desk/thesis.tex"]
 
     def test_without_fsspec_the_extra_is_named(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setitem(__import__("sys").modules, "fsspec.core", None)
+        monkeypatch.setitem(sys.modules, "fsspec.core", None)
         with pytest.raises(sw.errors.MissingDependencyError, match=r"fsspec.*pip install 'scanweld\[cluster\]'"):
             list_files("memory://lab")
 
@@ -355,3 +358,39 @@ class TestPage:
         page = make_batch_page("runs", rows, [], 1.0)
         assert "ATE" not in page
         assert '<section id="settings" aria-labelledby="settings-title" hidden>' in page
+
+
+class TestCommand:
+    def test_without_dask_the_extra_is_named(self, monkeypatch: Any, capsys: Any, tmp_path: Path) -> None:
+        monkeypatch.setitem(sys.modules, "distributed", None)
+        assert run(["batch", "desk", "--out", str(tmp_path)]) == 1
+        assert capsys.readouterr().err == (
+            "error: this needs distributed, which is not installed: pip install 'scanweld[cluster]'\n"
+        )
+
+    @pytest.mark.parametrize(
+        ("arguments", "told"),
+        [
+            (["--sweep", "tracking.stable_fractoin=1,2"], "did you mean 'tracking.stable_fraction'"),
+            (["--sweep", "seed"], "expected key=value,value"),
+            (["--memory", "plenty"], "expected for example 4GB"),
+            (["--scheduler", "tcp://127.0.0.1:1", "--workers", "2"], "has workers of its own"),
+        ],
+    )
+    def test_what_is_wrong_is_told_before_anything_runs(
+        self, arguments: list[str], told: str, desk: Path, tmp_path: Path, capsys: Any
+    ) -> None:
+        assert run(["batch", str(desk), "--out", str(tmp_path / "runs"), *arguments]) == 1
+        assert told in capsys.readouterr().err.splitlines()[-1]
+        assert not (tmp_path / "runs").exists()
+
+    def test_progress_in_a_pipe(self, capsys: Any) -> None:
+        """A line for each that ended; word of what was before, which comes late, is not taken in."""
+        with BatchProgress(["desk", "room"]) as progress:
+            progress.working(0, {"doing": "opening"})
+            progress.ended(Outcome(0, State.DONE, "trustworthy", "All is well."))
+            progress.working(0, {"frame": 3, "total": 9})
+            progress.ended(Outcome(1, State.FAILED, reason="room: no such folder"))
+        assert capsys.readouterr().err.splitlines() == [
+            "1/2  desk  trustworthy", "2/2  room  failed: room: no such folder"
+        ]  # fmt: skip

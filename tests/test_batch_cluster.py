@@ -22,8 +22,10 @@ import pytest
 from scanweld.cluster.batch import ClusterOptions, run_batch
 from scanweld.cluster.outcome import Outcome, State
 from scanweld.cluster.plan import plan_batch
+from scanweld.cluster.scheduler import connected
 from scanweld.cluster.task import RunTask
 from scanweld.datasets.synthetic import RenderConfig, render_sequence
+from scanweld.errors import InvalidInputError
 from scanweld.runs.folder import CHECKPOINT
 from scanweld.runs.input import RunInput
 from scanweld.slam.config import SlamConfig
@@ -125,6 +127,17 @@ def test_a_sequence_that_kills_its_workers_is_given_up(recordings: Path, tmp_pat
     killer.join(PATIENCE_S)
     assert [outcome.state for outcome in outcomes] == [State.FAILED, State.DONE]
     assert outcomes[0].reason == "its worker was lost: killed, or out of memory"
+
+
+def test_workers_that_have_less_than_is_asked_for(recordings: Path, tmp_path: Path) -> None:
+    """Nothing would ever run; workers that say nothing of what they have are taken as they are."""
+    tasks = tasks_of(recordings, "a", tmp_path)
+    with connected(workers=1, resources={"threads": 1}) as client:
+        options = ClusterOptions(scheduler=client.scheduler_info()["address"], threads=2)
+        with pytest.raises(InvalidInputError, match="no worker offers threads=2; start them with --resources"):
+            run_batch(tasks, options, Witness())
+        (outcome,) = run_batch(tasks, replace(options, threads=1, memory="4GB"), Witness())
+        assert outcome.good
 
 
 @contextlib.contextmanager
