@@ -361,12 +361,17 @@ class TestPage:
 
 
 class TestCommand:
-    def test_without_dask_the_extra_is_named(self, monkeypatch: Any, capsys: Any, tmp_path: Path) -> None:
-        monkeypatch.setitem(sys.modules, "distributed", None)
-        assert run(["batch", "desk", "--out", str(tmp_path)]) == 1
+    @pytest.mark.parametrize("package", ["distributed", "pyarrow"])
+    def test_what_is_not_installed_is_named(
+        self, package: str, desk: Path, monkeypatch: Any, capsys: Any, tmp_path: Path
+    ) -> None:
+        """Before anything is run."""
+        monkeypatch.setitem(sys.modules, package, None)
+        assert run(["batch", str(desk), "--out", str(tmp_path / "runs")]) == 1
         assert capsys.readouterr().err == (
-            "error: this needs distributed, which is not installed: pip install 'scanweld[cluster]'\n"
+            f"error: this needs {package}, which is not installed: pip install 'scanweld[cluster]'\n"
         )
+        assert not (tmp_path / "runs").exists()
 
     @pytest.mark.parametrize(
         ("arguments", "told"),

@@ -85,13 +85,14 @@ def batch(
     from scanweld.cluster.plan import plan_batch
     from scanweld.cluster.scheduler import load_distributed
     from scanweld.cluster.storage import join, name_of, write_to
-    from scanweld.cluster.table import TABLE_FILE, rows_of, write_table
+    from scanweld.cluster.table import TABLE_FILE, load_pyarrow, rows_of, write_table
     from scanweld.report.batch_page import make_batch_page
     from scanweld.report.page import REPORT_FILE
     from scanweld.runs.input import RunInput
     from scanweld.slam.warmup import compile_kernels
 
     load_distributed()
+    load_pyarrow()  # what is missing is told before hours of work
     given, sweeps = overrides or [], sweep or []
     options = ClusterOptions(
         scheduler=scheduler, workers=workers, threads=threads, memory=memory, retries=retries,

@@ -35,6 +35,22 @@ def rows_of(tasks: Sequence[RunTask], outcomes: Sequence[Outcome]) -> list[dict[
     ]
 
 
+def load_pyarrow() -> Any:
+    """Return the module `pyarrow`, with `pyarrow.parquet`.
+
+    Raises
+    ------
+    MissingDependencyError
+        When it is not installed.
+    """
+    try:
+        import pyarrow
+        import pyarrow.parquet
+    except ModuleNotFoundError:
+        raise MissingDependencyError("pyarrow", "cluster") from None
+    return pyarrow
+
+
 def write_table(rows: Sequence[Mapping[str, Any]], place: str) -> None:
     """Write rows as Parquet, path or URL; a value that a row does not have is null.
 
@@ -45,17 +61,12 @@ def write_table(rows: Sequence[Mapping[str, Any]], place: str) -> None:
     MissingDependencyError
         When pyarrow is not installed.
     """
-    try:
-        import pyarrow as pa
-        import pyarrow.parquet as pq
-    except ModuleNotFoundError:
-        raise MissingDependencyError("pyarrow", "cluster") from None
-    columns = {
-        name: pa.array([row.get(name) for row in rows]) for name in dict.fromkeys(k for row in rows for k in row)
-    }
+    pa = load_pyarrow()
+    names = dict.fromkeys(name for row in rows for name in row)
+    columns = {name: pa.array([row.get(name) for row in rows]) for name in names}
     typed = {name: c.cast(pa.float64()) if pa.types.is_null(c.type) else c for name, c in columns.items()}
     buffer = io.BytesIO()
-    pq.write_table(pa.table(typed), buffer)
+    pa.parquet.write_table(pa.table(typed), buffer)
     write_to(place, buffer.getvalue())
 
 
