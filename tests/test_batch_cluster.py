@@ -39,13 +39,13 @@ MANY = 30
 
 @pytest.fixture(scope="module")
 def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Sequences "a" and "b" of few frames, "heavy" with much beside them, "long" of more, "corrupt" of no images."""
+    """Sequences "a" and "b" of few frames, "heavy" with much beside, which is run first, "long", and a corrupt one."""
     folder = tmp_path_factory.mktemp("recordings")
     small = RenderConfig(scene="room", noise="none", frames=4, width=160, height=120)
     render_sequence(folder / "a", small)
     for name in ("b", "heavy", "corrupt"):
         shutil.copytree(folder / "a", folder / name)
-    (folder / "heavy" / "notes.txt").write_bytes(b"\n" * 20_000_000)  # which has it run first
+    (folder / "heavy" / "notes.txt").write_bytes(b"\n" * 20_000_000)
     for image in (folder / "corrupt").rglob("*.png"):
         image.write_bytes(b"\xff" * 1000)
     render_sequence(folder / "long", replace(small, frames=MANY))

@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import math
 import queue
+import threading
 import time
 import uuid
 from collections import deque
@@ -171,8 +172,15 @@ class _Batch:
     outcomes: dict[int, Outcome] = field(default_factory=dict)
     under_way: dict[Future, RunTask] = field(default_factory=dict)
 
+    ranks: dict[int, int] = field(default_factory=dict)
+
     def __post_init__(self) -> None:
-        self.waiting = deque(largest_first(self.tasks))
+        self.waiting = deque(self.tasks)
+        threading.Thread(target=self._rank, daemon=True).start()
+
+    def _rank(self) -> None:
+        """Find out which are large while the first are run: for thousands that takes minutes, and matters late."""
+        self.ranks = {task.number: rank for rank, task in enumerate(largest_first(self.tasks))}
 
     def run(self, client: Client) -> None:
         """Hand over one task for each free place until all have ended."""
@@ -188,6 +196,9 @@ class _Batch:
                     if not places and not self.under_way and not idle_told:
                         self.observer.say("the scheduler has no workers yet; waiting for them")
                         idle_told = True
+                if self.ranks:
+                    self.waiting = deque(sorted(self.waiting, key=lambda task: self.ranks[task.number]))
+                    self.ranks = {}
                 while self.waiting and len(self.under_way) < places:
                     future = self._submit(client, self.waiting.popleft(), asked)
                     future.add_done_callback(ended.put)
