@@ -113,17 +113,23 @@ class Linker:
 
     def _spread(self, moving: Fragment, still: Fragment, seeds: Mapping[int, Place], placed: dict[int, Place]) -> None:
         """Align keyframes of one fragment with the maps of another, from seeds on to their neighbours; adds them."""
-        count = len(moving.database)
-        for order in (range(count), range(count - 1, -1, -1)):
-            last: int | None = None
-            for j in order:
-                if j not in placed:
-                    start = seeds.get(j) or (None if last is None else _beside(moving, last, placed[last], j))
-                    place = None if start is None else self._aligned(moving, still, j, start)
-                    if place is None:
-                        continue
-                    placed[j] = place
-                last = j
+        for seed, start in seeds.items():
+            if seed in placed or not self._add(moving, still, seed, start, placed):
+                continue
+            for step in (1, -1):
+                last, j = seed, seed + step
+                while 0 <= j < len(moving.database) and j not in placed:
+                    beside = _beside(moving, last, placed[last], j)
+                    if beside is None:
+                        break
+                    last = j if self._add(moving, still, j, beside, placed) else last
+                    j += step
+
+    def _add(self, moving: Fragment, still: Fragment, j: int, start: Place, placed: dict[int, Place]) -> bool:
+        place = self._aligned(moving, still, j, start)
+        if place is not None:
+            placed[j] = place
+        return place is not None
 
     def _aligned(self, moving: Fragment, still: Fragment, j: int, start: Place) -> Place | None:
         """Align a keyframe with a map of another fragment; None where there is no map, or it does not fit.
