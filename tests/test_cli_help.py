@@ -21,7 +21,7 @@ OPTIONS = {
     "check": "--format --topics --camera --depth-scale --frames --json",
     "slam": "--out --format --camera --depth-scale --frames --scale --poses --config --set --threads --force --json "
     "--tracked-only --topics --refine --calibrate --realtime --resume --checkpoint-every --view --view-host "
-    "--view-port --rerun",
+    "--view-port --rerun --fragments --scheduler --workers",
     "batch": "--out --scheduler --workers --sweep --set --config --format --topics --camera --depth-scale --frames "
     "--scale --threads --memory --retries --checkpoint-every --force --json",
     "register": "--method --scale --init --global --voxel --max-distance --set --threads --explain --plot --out --json",
