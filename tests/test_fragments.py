@@ -219,6 +219,14 @@ class TestRun:
         assert (run.folder / "map.ply").read_bytes() == (tmp_path / "run/map.ply").read_bytes()
         assert len(again.results) == COUNT
 
+    def test_folder_of_somebody_else_is_left_alone(self, tmp_path: Path) -> None:
+        mine = tmp_path / f"run{ENDING}" / "thesis.txt"
+        mine.parent.mkdir()
+        mine.write_text("years of work")
+        with pytest.raises(sw.OutputError, match="something else than fragments"):
+            run_fragments(walk, 3, CONFIG, out=tmp_path / "run", force=True)
+        assert mine.read_text() == "years of work"
+
     def test_blind_fragment_is_named_and_nothing_is_made_up(self, tmp_path: Path) -> None:
         """Frames 30 to 71 of 72 show no depth: the first of two fragments has 30, the second none."""
         sequence = walk().part(0, 72)

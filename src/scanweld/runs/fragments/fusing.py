@@ -25,6 +25,9 @@ from scanweld.runs.fragments.making import Workplace, read_map
 BLOCK_M = 16 * CELL_M
 """Edge of a block [m]: a task that is worth sending away, and a few hundred megabytes at most."""
 
+BLOCK_FOLDER = "block-"
+"""What the names of the folders of blocks begin with."""
+
 LEAST_BUDGET_MB = 256.0
 """Memory for surfels of the process that writes the whole map [MB], where the configuration gives no budget."""
 
@@ -41,7 +44,7 @@ class Block:
     @property
     def name(self) -> str:
         """What its folder is called."""
-        return f"block-{self.component}-{self.x}-{self.y}-{self.z}"
+        return f"{BLOCK_FOLDER}{self.component}-{self.x}-{self.y}-{self.z}"
 
 
 def sort_into_blocks(place: Workplace, piece: Piece, number: int, *, last: bool) -> list[Block]:

@@ -41,6 +41,9 @@ OpenSequence = Callable[[], RgbdSequence]
 
 FRAGMENT, KEYFRAMES = "fragment.swc", "keyframes.swc"
 
+FRAGMENT_FOLDER = "fragment-"
+"""What the names of the folders of fragments begin with."""
+
 
 class Fragment(Stateful):
     """What the whole run has to know of a fragment: little, whatever its length.
@@ -101,7 +104,7 @@ class Workplace:
 
     def folder_of(self, part: int) -> Path:
         """Return the folder of a fragment."""
-        return self.folder / f"fragment-{part:04d}"
+        return self.folder / f"{FRAGMENT_FOLDER}{part:04d}"
 
 
 def make_fragment(place: Workplace, open_sequence: OpenSequence, part: Part) -> int:

@@ -17,9 +17,16 @@ from scanweld.errors import DatasetError, InvalidInputError, OutputError
 from scanweld.runs.checkpoint.identity import fingerprint_of
 from scanweld.runs.folder import check_writable, write_folder
 from scanweld.runs.fragments.assembling import Assembly, assemble
-from scanweld.runs.fragments.fusing import Block, fuse_block, sort_into_blocks, whole_map
+from scanweld.runs.fragments.fusing import BLOCK_FOLDER, Block, fuse_block, sort_into_blocks, whole_map
 from scanweld.runs.fragments.linking import link_fragments
-from scanweld.runs.fragments.making import Fragment, OpenSequence, Workplace, make_fragment, read_fragment
+from scanweld.runs.fragments.making import (
+    FRAGMENT_FOLDER,
+    Fragment,
+    OpenSequence,
+    Workplace,
+    make_fragment,
+    read_fragment,
+)
 from scanweld.runs.fragments.outcome import FragmentsOutcome, joined_results
 from scanweld.runs.output import write_run
 from scanweld.runs.run import RunSummary
@@ -131,14 +138,18 @@ class _Tasks:
         making = {submit(make_fragment, place, open_sequence, part): part for part in parts}
         linking: dict[tuple[int, int], Future[list[Any]]] = {}
         there: list[Part] = []
-        for part in self._done(making, "fragments"):
-            for other in there:
-                a, b = sorted((other, part), key=lambda p: p.index)
-                linking[a.index, b.index] = submit(link_fragments, place, a, b)
-            there.append(part)
-        for _ in self._done({future: pair for pair, future in linking.items()}, "links between fragments"):
-            pass
-        return {pair: linking[pair].result() for pair in sorted(linking)}
+        try:
+            for part in self._done(making, "fragments"):
+                for other in there:
+                    a, b = sorted((other, part), key=lambda p: p.index)
+                    linking[a.index, b.index] = submit(link_fragments, place, a, b)
+                there.append(part)
+            for _ in self._done({future: pair for pair, future in linking.items()}, "links between fragments"):
+                pass
+            return {pair: linking[pair].result() for pair in sorted(linking)}
+        finally:
+            for future in linking.values():  # where a fragment could not be made
+                future.cancel()
 
     def fuse(self, assembly: Assembly) -> dict[int, list[Block]]:
         """Move all surfels, and fuse them block by block; returns the blocks of each component."""
@@ -236,10 +247,12 @@ def _work_folder(out: Path | None, *, resume: bool) -> Iterator[Path]:
             yield Path(temporary)
         return
     folder = out.resolve().with_name(out.name + ENDING)
-    if not resume:
-        shutil.rmtree(folder, ignore_errors=True)
+    left = list(folder.iterdir()) if folder.exists() else []
+    if any(not path.name.startswith((FRAGMENT_FOLDER, BLOCK_FOLDER)) for path in left):
+        raise OutputError(f"{folder}: holds something else than fragments; choose another --out")
+    for path in left:
+        if not resume or path.name.startswith(BLOCK_FOLDER):  # blocks are of poses that may be others now
+            shutil.rmtree(path)
     folder.mkdir(parents=True, exist_ok=True)
-    for blocks in folder.glob("block-*"):
-        shutil.rmtree(blocks)  # of poses that were others
     yield folder
     shutil.rmtree(folder, ignore_errors=True)
