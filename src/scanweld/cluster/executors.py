@@ -12,8 +12,8 @@ from collections.abc import Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor
 from typing import cast
 
-from scanweld.cluster.scheduler import connected
-from scanweld.errors import InvalidInputError
+from scanweld.cluster.scheduler import connected, load_distributed
+from scanweld.errors import InvalidInputError, OutputError
 from scanweld.parallel import get_num_threads
 
 RETRIES = 2
@@ -33,12 +33,15 @@ def opened_executor(scheduler: str | None = None, *, workers: int | None = None)
     Raises
     ------
     MissingDependencyError, OutputError, InvalidInputError
-        As :func:`~.scheduler.connected`.
+        As :func:`~.scheduler.connected`; OutputError, too, when workers are lost again and again.
     """
     if scheduler is not None:
         with connected(scheduler, workers=workers) as client:
-            # Tasks write files: none is like another one.
-            yield cast(Executor, client.get_executor(pure=False, retries=RETRIES))
+            try:
+                # Tasks write files: none is like another one.
+                yield cast(Executor, client.get_executor(pure=False, retries=RETRIES))
+            except load_distributed().KilledWorker as error:
+                raise OutputError(f"{scheduler}: workers were lost again and again: {error}") from None
         return
     if workers is not None and workers < 1:
         raise InvalidInputError(f"workers: expected at least one, got {workers}")
