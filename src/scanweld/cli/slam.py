@@ -208,17 +208,15 @@ def run_in_fragments(
                 progress.begin(what)
             progress.update(done, total)
 
-        with opened_executor(scheduler, workers=workers) as executor:
-            return run_fragments(
-                source.open,
-                number,
-                config,
-                out=folder,
-                executor=executor,
-                threads=threads or 1,
-                progress=told,
-                **options,
-            )
+        try:
+            with opened_executor(scheduler, workers=workers) as executor:
+                return run_fragments(
+                    source.open, number, config, out=folder, executor=executor, threads=threads or 1, progress=told,
+                    **options,
+                )  # fmt: skip
+        except KeyboardInterrupt:
+            progress.begin(f"what is done is kept: the same command with --out {folder} --resume goes on from there")
+            raise
 
 
 def print_summary(summary: RunSummary, *, json_output: bool) -> int:

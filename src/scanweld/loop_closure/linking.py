@@ -70,7 +70,7 @@ class Place:
 
 
 @dataclass(frozen=True, slots=True)
-class Fragment:
+class MappedPart:
     """What is known of one part of a recording.
 
     Attributes
@@ -92,7 +92,7 @@ class Linker:
         self.aligner = aligner
         self.config = config or LoopClosingConfig()
 
-    def link(self, a: Fragment, b: Fragment, seen: Mapping[int, Place]) -> list[Edge]:
+    def link(self, a: MappedPart, b: MappedPart, seen: Mapping[int, Place]) -> list[Edge]:
         """Return what ties the keyframes of two fragments together: edges from i of `a` to j of `b`, perhaps wrong.
 
         Parameters
@@ -111,7 +111,9 @@ class Linker:
     def _edge(self, i: int, j: int, T_i_j: Float64) -> Edge:
         return tracked_edge(i, j, T_i_j, self.config.drift, loop=True)
 
-    def _spread(self, moving: Fragment, still: Fragment, seeds: Mapping[int, Place], placed: dict[int, Place]) -> None:
+    def _spread(
+        self, moving: MappedPart, still: MappedPart, seeds: Mapping[int, Place], placed: dict[int, Place]
+    ) -> None:
         """Align keyframes of one fragment with the maps of another, from seeds on to their neighbours; adds them."""
         for seed, start in seeds.items():
             if seed in placed or not self._add(moving, still, seed, start, placed):
@@ -125,13 +127,13 @@ class Linker:
                     last = j if self._add(moving, still, j, beside, placed) else last
                     j += step
 
-    def _add(self, moving: Fragment, still: Fragment, j: int, start: Place, placed: dict[int, Place]) -> bool:
+    def _add(self, moving: MappedPart, still: MappedPart, j: int, start: Place, placed: dict[int, Place]) -> bool:
         place = self._aligned(moving, still, j, start)
         if place is not None:
             placed[j] = place
         return place is not None
 
-    def _aligned(self, moving: Fragment, still: Fragment, j: int, start: Place) -> Place | None:
+    def _aligned(self, moving: MappedPart, still: MappedPart, j: int, start: Place) -> Place | None:
         """Align a keyframe with a map of another fragment; None where there is no map, or it does not fit.
 
         It is aligned with its own map in the same way, and the difference is what counts: so the errors that the image
@@ -148,13 +150,13 @@ class Linker:
             return None
         return Place(start.submap, there @ se3.inverse(here) @ keyframe.T_world_camera)
 
-    def _tracked(self, pyramid: SurfacePyramid, fragment: Fragment, start: Place) -> Float64 | None:
+    def _tracked(self, pyramid: SurfacePyramid, fragment: MappedPart, start: Place) -> Float64 | None:
         view = fragment.map_of(start.submap).view(start.T_world_camera, pyramid.frame.camera)
         found = self.aligner.track(pyramid, view, start.T_world_camera)
         off = views_apart(se3.inverse(start.T_world_camera) @ found.T_target_source)
         return found.T_target_source if found.status.success and off < _MOST_OFF else None
 
-    def _recognise(self, moving: Fragment, still: Fragment, placed: dict[int, Place]) -> None:
+    def _recognise(self, moving: MappedPart, still: MappedPart, placed: dict[int, Place]) -> None:
         """Look for keyframes that are not placed among those of the other fragment, and go on from where they are."""
         first, first_submap = len(still.database), 1 + int(still.submaps.max(initial=0))
         keyframes = [
@@ -184,7 +186,7 @@ class Linker:
         return self.config.places.keyframes.surfaces
 
 
-def _beside(moving: Fragment, last: int, place: Place, j: int) -> Place | None:
+def _beside(moving: MappedPart, last: int, place: Place, j: int) -> Place | None:
     """Return where a keyframe is if it lies to a placed one as in its own world; None where that is too far away."""
     T_last_j = se3.inverse(moving.database[last].T_world_camera) @ moving.database[j].T_world_camera
     if moving.submaps[last] != moving.submaps[j] or views_apart(T_last_j) > APART:
@@ -192,7 +194,7 @@ def _beside(moving: Fragment, last: int, place: Place, j: int) -> Place | None:
     return Place(place.submap, place.T_world_camera @ T_last_j)
 
 
-def _nearest_keyframe(fragment: Fragment, place: Place) -> tuple[int, float]:
+def _nearest_keyframe(fragment: MappedPart, place: Place) -> tuple[int, float]:
     """Return the keyframe of a fragment that looked from nearest by, and how far apart the views are."""
     mine = np.flatnonzero(fragment.submaps == place.submap)
     if len(mine) == 0:
@@ -202,14 +204,14 @@ def _nearest_keyframe(fragment: Fragment, place: Place) -> tuple[int, float]:
     return int(mine[apart.argmin()]), float(apart.min())
 
 
-def _nearest(still: Fragment, placed: Iterable[tuple[int, Place]]) -> Iterator[tuple[int, int, Float64]]:
+def _nearest(still: MappedPart, placed: Iterable[tuple[int, Place]]) -> Iterator[tuple[int, int, Float64]]:
     """Yield the nearest keyframe i of a fragment to each one j that was placed in it, and T_i_j."""
     for j, place in placed:
         i, _ = _nearest_keyframe(still, place)
         yield i, j, se3.inverse(still.database[i].T_world_camera) @ place.T_world_camera
 
 
-def _seen_from(still: Fragment, moving: Fragment, j: int, place: Place) -> tuple[int, Place]:
+def _seen_from(still: MappedPart, moving: MappedPart, j: int, place: Place) -> tuple[int, Place]:
     """Return the keyframe of one fragment that is nearest to one of another, and where it is in the world of that."""
     ((i, _, T_i_j),) = _nearest(still, [(j, place)])
     return i, Place(int(moving.submaps[j]), moving.database[j].T_world_camera @ se3.inverse(T_i_j))

@@ -33,12 +33,12 @@ def link_fragments(place: Workplace, a: Part, b: Part) -> list[Edge]:
     return [*_seams(a, b, first, second, config.drift), *loops]
 
 
-def _known(place: Workplace, part: Part, note: Fragment) -> linking.Fragment:
+def _known(place: Workplace, part: Part, note: Fragment) -> linking.MappedPart:
     @lru_cache
     def map_of(submap: int) -> linking.MapView:
         return read_map(place, part.index, submap)
 
-    return linking.Fragment(read_keyframes(place, part.index), note.submaps, map_of)
+    return linking.MappedPart(read_keyframes(place, part.index), note.submaps, map_of)
 
 
 def _seen_by_both(a: Part, b: Part, first: Fragment, second: Fragment) -> dict[int, Place]:
