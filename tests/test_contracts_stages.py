@@ -456,10 +456,11 @@ class TestObserver:
             (Onlooker(nudge), "on_frame: it has changed"),
             (Onlooker(thin), "an observer has changed the run"),
             (Onlooker(ready=lambda timeout_s: None), "expected True or False"),
-            (Onlooker(ready=lambda timeout_s: bool(time.sleep(1.0))), "no after 1.0"),
+            (Onlooker(ready=lambda timeout_s: bool(time.sleep(0.3))), "where it may take 0.05 s"),
         ],
     )
-    def test_broken(self, observer: Onlooker, words: str) -> None:
+    def test_broken(self, observer: Onlooker, words: str, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr("scanweld.testing.observers._SLACK_S", 0.1)
         with breaks(words):
             testing.check_observer(lambda: observer)
 

@@ -6,11 +6,14 @@ import numpy as np
 import pytest
 
 from scanweld.geometry import se3
+from scanweld.registration.closed_form.align import _words as axis_words
 from scanweld.registration.gauss_newton import (
+    NormalEquations,
     free_directions,
     moved_origin,
     solve,
     spectrum,
+    standard_deviation,
 )
 from scanweld.registration.residuals import normal_equations, point_to_plane
 
@@ -144,3 +147,34 @@ def test_information_about_another_origin(dimension):
     offset = rng.normal(size=dimension)
     here, there = equations_of(points, normals), equations_of(points + offset, normals)
     np.testing.assert_allclose(moved_origin(here.information, offset), there.information, atol=1e-10)
+
+
+def test_a_turn_of_the_plane_is_about_the_centroid():
+    """Points in one place hold no turn: what is free leaves the centroid (3, 5) where it is, phi (-5, 3) + rho = 0."""
+    c = np.array([3.0, 5.0])
+    information = np.diag([1.0, 1.0, 0.0])
+    information[:2, 2] = information[2, :2] = [-c[1], c[0]]  # a turn moves the point by (-y, x)
+    information[2, 2] = c @ c
+    equations = NormalEquations(information, np.zeros(3), 1.0, c, 1.0)
+    parts = spectrum(equations)
+    assert parts.observable.tolist() == [False, True, True]
+    rho, phi = parts.basis[:2, 0], parts.basis[2, 0]
+    np.testing.assert_allclose(phi * np.array([-c[1], c[0]]) + rho, 0, atol=1e-9)
+    assert abs(phi) > 0.1
+
+
+def test_what_is_free_does_not_make_the_rest_certain():
+    """A wall 1 m across, seen with weights 1 / sigma^2 = 1e4 by 400 points: sigma / sqrt(400) along its normal, and
+    more for the two tilts; nothing is known where nothing is seen."""
+    points, normals = plane()
+    residuals, jacobian = point_to_plane(points, points, normals)
+    equations = normal_equations(points, residuals, jacobian, np.full(len(points), 1e4))
+    expected = np.sqrt((1 / spectrum(equations).values[3:]).sum() / (400 * 1e4))
+    assert standard_deviation(equations, spectrum(equations)) == pytest.approx(expected)
+    assert 0.01 / 20 < expected < 0.01 / 5
+    nothing = NormalEquations(np.zeros((6, 6)), np.zeros(6), 1.0, np.zeros(3), 1.0)
+    assert standard_deviation(nothing, spectrum(nothing)) == 0
+
+
+def test_names_have_no_negative_zero():
+    assert axis_words(np.array([-1.0, 0.004, -0.004])) == "(1.00, 0.00, 0.00)"

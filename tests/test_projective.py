@@ -16,7 +16,13 @@ from scanweld.datasets.synthetic import NOISE_MODELS, degrade_depth
 from scanweld.geometry import se3
 from scanweld.geometry.depth import SurfaceLevel, surface_image
 from scanweld.registration.gauss_newton import NormalEquations, solve, spectrum
-from scanweld.registration.projective import ProjectiveConfig, ProjectiveStep, align_projective, projective_step
+from scanweld.registration.projective import (
+    ProjectiveConfig,
+    ProjectiveStep,
+    _largest_shift,
+    align_projective,
+    projective_step,
+)
 from scanweld.tracking.two_frames import surface_points
 
 SMALL = sw.PinholeCamera(40.0, 41.0, 19.3, 14.8, 40, 30)
@@ -297,3 +303,13 @@ class TestHonesty:
         result = align_projective(positions, normals, levels, se3.exp([0.03, 0, 0, 0, 0, 0]), config)
         assert result.status is sw.Status.MAX_ITERATIONS
         assert "still moving after 3 iterations" in result.note
+
+
+def test_largest_shift_is_that_of_the_centroid_and_of_a_turn_about_it() -> None:
+    """A point at c moves by rho + phi x c, one at a distance of r from it by r |phi| more at most."""
+    rng = np.random.default_rng(0)
+    for xi, centroid, radius in zip(
+        rng.normal(size=(5, 6)), rng.normal(size=(5, 3)), rng.uniform(0, 2, 5), strict=True
+    ):
+        expected = np.linalg.norm(xi[:3] + np.cross(xi[3:], centroid)) + radius * np.linalg.norm(xi[3:])
+        assert _largest_shift(xi, centroid, radius) == pytest.approx(expected)

@@ -186,6 +186,18 @@ def test_disc_covers_the_pixels_whose_rays_meet_it(normal: tuple[float, ...]) ->
     assert not picture.normals[~drawn].any()
 
 
+@pytest.mark.parametrize("row", [-2, 3, 59, 60, 61, 117, 121])
+def test_disc_is_whole_wherever_bands_of_the_image_meet(row: int) -> None:
+    """Threads draw 60 rows each. A disc of radius 0.1 at 1 m is 4 pixels: it belongs to two of them, or reaches in."""
+    tall = sw.PinholeCamera(40.0, 40.0, 9.5, 59.5, 20, 120)
+    centre = np.array([0.0, (row - tall.cy) / tall.fy, 1.0])
+    drawn = np.isfinite(render_picture(disc([*centre], [0, 0, -1], 0.1), np.eye(4), tall).depth_m)
+    distance = np.linalg.norm(tall.rays() - centre, axis=-1)
+    assert drawn[distance < 0.1].all()
+    assert drawn.any()
+    assert not drawn[distance > 0.1 + 0.76 / 40].any()
+
+
 def test_nearest_disc_is_on_top_whatever_the_order() -> None:
     for order in ((0.8, 1.2), (1.2, 0.8)):
         surfels = sw.SurfelMap()

@@ -21,6 +21,7 @@ from scanweld.geometry.neighbours.grid import HashGrid
 from scanweld.geometry.normals import estimate_normals
 from scanweld.geometry.views import MapCorrection
 from scanweld.loop_closure.loop_closer import KeyframeLoopCloser
+from scanweld.mapping import kernels as map_kernels
 from scanweld.mapping.rendering import render_picture
 from scanweld.mapping.storage.pages import MapConfig
 from scanweld.meshing.config import MeshConfig
@@ -110,6 +111,20 @@ def test_a_board_that_passes_does_not_carry_the_camera_off() -> None:
         if result.state is sw.FrameState.TRACKING:
             assert pose_error(result.T_world_camera, np.eye(4))[0] < 0.05
     assert slam.results[0].state is sw.FrameState.TRACKING
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_a_surfel_agrees_along_every_axis(axis: int) -> None:
+    """Of a measurement with its normal along an axis: within the gate of 1 cm along it, within 3 cm in all, and facing
+    the same way within 60 degrees."""
+    n, beside = np.eye(3)[axis], np.eye(3)[axis - 1]
+    for d, normal, expected in (
+        (0.009 * n, n, True), (0.011 * n, n, False), (-0.011 * n, n, False), (0.029 * beside, n, True),
+        (-0.031 * beside, n, False), (0.02 * beside + 0.02 * np.eye(3)[axis - 2], n, True),
+        (0.022 * beside + 0.022 * np.eye(3)[axis - 2], n, False), (0 * n, -n, False),
+        (0 * n, 0.6 * n + 0.8 * beside, True), (0 * n, 0.4 * n + 0.9 * beside, False),
+    ):  # fmt: skip
+        assert map_kernels.agrees(*d, *normal, *n, 0.01, 0.03, 0.5) == expected
 
 
 def test_regions_grow_from_their_seeds() -> None:
