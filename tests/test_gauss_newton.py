@@ -158,6 +158,7 @@ def test_a_turn_of_the_plane_is_about_the_centroid():
     equations = NormalEquations(information, np.zeros(3), 1.0, c, 1.0)
     parts = spectrum(equations)
     assert parts.observable.tolist() == [False, True, True]
+    np.testing.assert_allclose(parts.values, [0, 1, 1], atol=1e-12)
     rho, phi = parts.basis[:2, 0], parts.basis[2, 0]
     np.testing.assert_allclose(phi * np.array([-c[1], c[0]]) + rho, 0, atol=1e-9)
     assert abs(phi) > 0.1

@@ -1109,3 +1109,16 @@ def test_a_prior_is_a_transform_and_what_is_known_of_it() -> None:
             MotionPrior.from_deviations(np.eye(4), translation_m=sigma, rotation_rad=1.0)
     prior = MotionPrior.from_deviations(np.eye(4), translation_m=[0.5, np.inf, 1], rotation_rad=0.1)
     np.testing.assert_allclose(np.diag(prior.information), [4, 0, 1, 100, 100, 100])
+
+
+def test_points_whose_normal_is_not_known_are_no_partners_of_planes() -> None:
+    """Every fifth point of the target has none, as where a scan is too thin: the others hold the motion as well."""
+    points = room(3000, 0)
+    normals = estimate_normals(points)
+    normals[::5] = 0
+    source = se3.transform_points(se3.inverse(MOTION), points)
+    result = icp(source, points, target_normals=normals, config=IcpConfig(method="point-to-plane"))
+    assert result.status is Status.CONVERGED
+    np.testing.assert_allclose(result.T_target_source, MOTION, atol=1e-4)
+    assert result.overlap == pytest.approx(0.8, abs=0.02)
+
