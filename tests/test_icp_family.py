@@ -1121,4 +1121,3 @@ def test_points_whose_normal_is_not_known_are_no_partners_of_planes() -> None:
     assert result.status is Status.CONVERGED
     np.testing.assert_allclose(result.T_target_source, MOTION, atol=1e-4)
     assert result.overlap == pytest.approx(0.8, abs=0.02)
-
