@@ -58,6 +58,7 @@ class Fragment(Stateful):
     num_closures, num_joins : loops closed, and submaps joined
     num_points_input : valid depth pixels, without the frames that the part before has, too
     median_depth_m : of the first frame with depth
+    content : checksum of what its frames show
     warnings : what the run warned of
     peak_rss_mb : memory of the process that made it
     """
@@ -65,6 +66,7 @@ class Fragment(Stateful):
     STATE: ClassVar = {
         "frames": Stateful, "keyframe_frames": Int64, "T_world_keyframe": Float64, "submaps": Int64,
         "edges": list[Edge], "num_closures": int, "num_joins": int, "num_points_input": int, "median_depth_m": float,
+        "content": int,
         "warnings": list[str], "peak_rss_mb": float | None,
     }  # fmt: skip
 
@@ -74,7 +76,7 @@ class Fragment(Stateful):
         self.T_world_keyframe: Float64 = np.empty((0, 4, 4))
         self.submaps: Int64 = np.empty(0, np.int64)
         self.edges: list[Edge] = []
-        self.num_closures = self.num_joins = self.num_points_input = 0
+        self.num_closures = self.num_joins = self.num_points_input = self.content = 0
         self.median_depth_m = 0.0
         self.warnings: list[str] = []
         self.peak_rss_mb: float | None = None
@@ -136,7 +138,7 @@ def make_fragment(place: Workplace, open_sequence: OpenSequence, part: Part) -> 
         made.keyframe_frames = np.array([keyframe.frame_index for keyframe in database.keyframes], np.int64)
         made.T_world_keyframe = np.array([k.T_world_camera for k in database.keyframes]).reshape(-1, 4, 4)
         made.num_closures, made.num_joins = slam.num_closures, slam.num_joins
-        made.median_depth_m = tally.median_depth_m
+        made.median_depth_m, made.content = tally.median_depth_m, tally.content
         made.warnings = [f"{part}: {warning}" for warning in tally.warnings]
         for submap, surfels in slam.maps.items():
             _write(folder / f"map-{submap}.swc", header, surfels)

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import shutil
+import struct
 import tempfile
 import time
+import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Executor, Future, ThreadPoolExecutor, as_completed
 from pathlib import Path
@@ -114,8 +116,10 @@ def run_fragments(
         if out is not None:
             given = dict(description or {})
             in_fragments, warnings = _described(parts, fragments, assembly, main_submap(outcome.results))
+            content = zlib.crc32(b"".join(struct.pack("<I", fragment.content) for fragment in fragments))
+            fingerprint = {**fingerprint_of(sequence, None), "content": f"{content:08x}"}
             given |= {
-                "tracked_only": tracked_only, "fragments": in_fragments, "fingerprint": fingerprint_of(sequence, None),
+                "tracked_only": tracked_only, "fragments": in_fragments, "fingerprint": fingerprint,
                 "warnings": [*given.get("warnings", ()), *warnings],
             }  # fmt: skip
             with write_folder(out, force=force) as aside:
