@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import scanweld as sw
-from rendered import MemorySequence, blind, rendered
+from rendered import MemorySequence, blind, rendered, write_tum_folder
 from scanweld.cli import app as command_line
 from scanweld.geometry import se3
 from scanweld.loop_closure.linking import common_motion
@@ -24,11 +24,13 @@ from scanweld.runs.fragments.assembling import assemble
 from scanweld.runs.fragments.making import Fragment
 from scanweld.runs.fragments.outcome import joined_results
 from scanweld.runs.fragments.run import ENDING, run_fragments
+from scanweld.runs.input import RunInput
+from scanweld.runs.repeat import repeat_run
 from scanweld.slam.motion import POSED
 from scanweld.slam.parts import FragmentConfig, Part, parts_of
 from scanweld.trajectory import FrameResult, FrameState
 
-COUNT, OVERLAP = 120, 12
+COUNT, OVERLAP = 96, 12
 CONFIG = sw.SlamConfig(fragments=FragmentConfig(overlap=OVERLAP))
 
 
@@ -180,7 +182,7 @@ class TestRun:
         assert run.folder is not None
         told = json.loads((run.folder / "run.json").read_text())
         parts = told["fragments"]["parts"]
-        assert [part["frames"] for part in parts] == [[0, 48], [36, 84], [72, 120]]
+        assert [part["frames"] for part in parts] == [[0, 40], [28, 68], [56, 96]]
         assert all(part["components"] == [0] for part in parts)
         pairs = {tuple(link["fragments"]): link["kept"] for link in told["fragments"]["links"]}
         assert pairs[0, 1] > 2
@@ -271,10 +273,18 @@ class TestRun:
         warnings = json.loads((tmp_path / "run/run.json").read_text())["warnings"]
         assert any("fragment 1 (frames 30 to 71): connects to no fragment" in warning for warning in warnings)
 
+    def test_is_repeated_in_fragments(self, tmp_path: Path) -> None:
+        place = write_tum_folder(tmp_path / "room", walk().part(0, 60))
+        recording = RunInput(str(place))
+        run_fragments(recording.open, 2, CONFIG, out=tmp_path / "run", description=recording.described())
+        repeated = repeat_run(tmp_path / "run", tmp_path / "again")
+        assert repeated.identical
+        assert len(json.loads((tmp_path / "again/run.json").read_text())["fragments"]["parts"]) == 2
+
     def test_what_cannot_be_run_in_fragments(self) -> None:
         with pytest.raises(sw.InvalidInputError, match="tied together by their keyframes"):
             run_fragments(walk, 3, replace(CONFIG, loop_closer="none"))
-        with pytest.raises(sw.InvalidInputError, match="make at most 4 fragments"):
+        with pytest.raises(sw.InvalidInputError, match="make at most 3 fragments"):
             run_fragments(walk, 5, CONFIG)
         nothing = walk().part(0, 40)
         dark = nothing.with_frames({k: blind(frame) for k, frame in enumerate(nothing.frames) if frame is not None})
