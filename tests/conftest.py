@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 from pathlib import Path
 
 import hypothesis
@@ -10,10 +11,14 @@ import pytest
 
 # Compiling a kernel on first use is slow and is no failure of a property.
 hypothesis.settings.register_profile("scanweld", deadline=None, derandomize=True, max_examples=50)
-hypothesis.settings.register_profile(
-    "few", hypothesis.settings.get_profile("scanweld"), max_examples=3
-)  # scripts/coverage
+few = hypothesis.settings(hypothesis.settings.get_profile("scanweld"), max_examples=3)
+hypothesis.settings.register_profile("few", few)  # for scripts/coverage
 hypothesis.settings.load_profile("scanweld")
+
+# A shell without job control has what it starts in the background ignore Ctrl-C, and so do the children of that: tests
+# of Ctrl-C would wait for nothing.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(scope="session")
