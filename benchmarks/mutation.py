@@ -3,11 +3,11 @@
     python benchmarks/mutation.py registration --sample 120 --out build/registration.md
     python benchmarks/mutation.py fusion
 
-mutmut 3 wraps every function in a trampoline, which Numba cannot compile, and cosmic-ray runs all tests for each
-mutant; neither draws a sample. So this: mutants are drawn with a fixed seed; a first run notes which tests come to
-which line (coverage contexts) and how long they take; each mutant is then met by the tests that come to its line, the
-quickest first, in a process that was forked with all but the package loaded. Mutated kernels run as plain Python
-(NUMBA_DISABLE_JIT=1): they would have to be compiled with all that call them.
+By what they document, mutmut 3 wraps every function in a trampoline, which Numba cannot compile, and cosmic-ray runs
+all tests for each mutant; neither draws a sample. So this: mutants are drawn with a fixed seed; a first run notes which
+tests come to which line (coverage contexts) and how long they take; each mutant is then met by the tests that come to
+its line, the quickest first, in a process that was forked with all but the package loaded. Mutated kernels run as plain
+Python (NUMBA_DISABLE_JIT=1): they would have to be compiled with all that call them.
 """
 
 from __future__ import annotations

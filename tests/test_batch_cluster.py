@@ -20,6 +20,7 @@ from typing import Any
 import pytest
 
 from scanweld.cluster.batch import ClusterOptions, run_batch
+from scanweld.cluster.observer import BatchObserver
 from scanweld.cluster.outcome import Outcome, State
 from scanweld.cluster.plan import plan_batch
 from scanweld.cluster.scheduler import connected
@@ -52,7 +53,7 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-class Witness:
+class Witness(BatchObserver):
     """Looks on at a batch."""
 
     def __init__(self) -> None:

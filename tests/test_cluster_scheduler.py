@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from scanweld.cluster.scheduler import connected
+from scanweld.cluster.scheduler import connected, load_distributed
 from scanweld.errors import InvalidInputError, MissingDependencyError, OutputError
 
 if TYPE_CHECKING:
@@ -77,6 +77,7 @@ def _target(link: Path) -> str:
 
 
 def test_log_of_dask_is_as_it_was_in_the_end() -> None:
+    load_distributed()  # which sets it
     before = logging.getLogger("distributed").level
 
     def interrupted() -> None:

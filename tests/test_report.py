@@ -365,9 +365,8 @@ class TestRuns:
 
     def test_keyframes_and_loops_are_kept(self, tmp_path: Path) -> None:
         """Keyframes 0 to 3 are of frames 0, 8, 20 and 31; loops tie the last to the first two."""
-        keyframes = [SimpleNamespace(frame_index=i) for i in (0, 8, 20, 31)]
-        closer = SimpleNamespace(database=SimpleNamespace(keyframes=keyframes), loops=[(0, 3), (3, 1)])
-        output.write_keyframes(tmp_path / "keyframes.csv", closer)  # type: ignore[arg-type]
+        outcome = SimpleNamespace(keyframe_frames=[0, 8, 20, 31], loops=[(0, 3), (3, 1)])
+        output.write_keyframes(tmp_path / "keyframes.csv", outcome)  # type: ignore[arg-type]
         frames, loops = read_keyframes(tmp_path / "keyframes.csv")
         assert frames.tolist() == [0, 8, 20, 31]
         assert loops.tolist() == [[31, 0], [31, 8]]

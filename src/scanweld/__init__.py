@@ -79,6 +79,7 @@ if TYPE_CHECKING:
     from scanweld.registration.result import RegistrationResult, Status
     from scanweld.registration.robust_pairs import RobustAlignment, align_pairs_robustly
     from scanweld.registration.uncertainty import point_covariances
+    from scanweld.runs.fragments.run import run_fragments
     from scanweld.runs.mesh import mesh_run
     from scanweld.runs.run import RunSummary, run_sequence
     from scanweld.slam.config import SlamConfig
@@ -137,6 +138,7 @@ _HOME = {
     "registration.pose_graph": ("PoseGraph", "PoseGraphConfig", "PoseGraphResult", "edge_information"),
     "registration.robust_pairs": ("RobustAlignment", "align_pairs_robustly"),
     "registration.uncertainty": ("point_covariances",),
+    "runs.fragments.run": ("run_fragments",),
     "runs.run": ("RunSummary", "run_sequence"),
     "slam.health": ("HealthConfig",),
     "slam.config": ("SlamConfig",),
@@ -255,6 +257,7 @@ __all__ = [
     "render_picture",
     "render_sequence",
     "rpe",
+    "run_fragments",
     "run_sequence",
     "se3",
     "set_backend",

@@ -14,6 +14,7 @@ from rich.logging import RichHandler
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, TextColumn, TimeRemainingColumn
 from rich.table import Column
 
+from scanweld.cluster.observer import BatchObserver
 from scanweld.trajectory import FrameResult, FrameState
 
 if TYPE_CHECKING:
@@ -110,8 +111,8 @@ class FrameProgress:
         logging.getLogger().handlers[:] = self._handlers
 
 
-class BatchProgress:
-    """Shows how many runs of a batch have ended, and how far those are that are at work (a `BatchObserver`)."""
+class BatchProgress(BatchObserver):
+    """Shows how many runs of a batch have ended, and how far those are that are at work."""
 
     def __init__(self, names: Sequence[str]) -> None:
         self._names, self._spoken = names, time.perf_counter()

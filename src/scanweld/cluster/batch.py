@@ -17,8 +17,9 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
+from scanweld.cluster.observer import BatchObserver
 from scanweld.cluster.outcome import Outcome, State, failed
 from scanweld.cluster.scheduler import CONNECT_S, connected, load_distributed
 from scanweld.cluster.storage import list_files
@@ -36,22 +37,6 @@ LISTED_AT_A_TIME = 16
 
 STOP_S = 120.0
 """Seconds that runs have after Ctrl-C to end with a checkpoint."""
-
-
-class BatchObserver(Protocol):
-    """Looks on while a batch goes by."""
-
-    def say(self, text: str) -> None:
-        """Take in a line about the cluster."""
-        ...
-
-    def working(self, number: int, what: Mapping[str, Any]) -> None:
-        """Take in how far a task is: {"frame", "total"} or {"doing"}."""
-        ...
-
-    def ended(self, outcome: Outcome) -> None:
-        """Take in what became of a task."""
-        ...
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
-from typing import Any, Protocol, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -67,18 +67,6 @@ class ScanFacts:
     gate_m: float
 
 
-class PairTasks(Protocol):
-    """Looks at scans, and aligns pairs of them."""
-
-    def describe(self) -> list[ScanFacts]:
-        """Return the facts of every scan."""
-        ...
-
-    def align(self, pairs: Sequence[tuple[int, int]], guesses: Sequence[Float64 | None]) -> list[RegistrationResult]:
-        """Align pairs (target, source), from guesses of T_target_source where there are some."""
-        ...
-
-
 class InProcess:
     """All scans in memory, each prepared once."""
 
@@ -124,6 +112,10 @@ class Distributed:
         finally:
             for future in futures:
                 future.cancel()
+
+
+PairTasks: TypeAlias = InProcess | Distributed
+"""Looks at scans, and aligns pairs (target, source) of them, from guesses of T_target_source where there are some."""
 
 
 def open_scan(scan: Scan, name: str) -> PointCloud:

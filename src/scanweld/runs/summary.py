@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import logging
 import sys
-from collections.abc import Mapping, Sequence
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
@@ -13,63 +12,17 @@ from scanweld.errors import InvalidInputError
 from scanweld.evaluation.surface_metrics import compression_ratio
 from scanweld.evaluation.trajectory_metrics import AteResult, ate, rpe
 from scanweld.slam.motion import POSED
-from scanweld.trajectory import FrameResult, FrameState, Trajectory
+from scanweld.trajectory import FrameState, Trajectory
+
+if TYPE_CHECKING:
+    from scanweld.runs.fragments.outcome import FragmentsOutcome
+    from scanweld.slam.system import Slam
 
 logger = logging.getLogger(__name__)
 
 
-class Outcome(Protocol):
-    """What a run came to: a :class:`~scanweld.slam.system.Slam` that has seen all frames, or fragments put together."""
-
-    @property
-    def results(self) -> Sequence[FrameResult]:
-        """One per frame, each in the world of its submap."""
-        ...
-
-    @property
-    def main_results(self) -> Sequence[FrameResult]:
-        """The same in the world of the main submap; frames of others are LOST there."""
-        ...
-
-    @property
-    def trajectory(self) -> Trajectory:
-        """One pose per frame, in the world of the main submap."""
-        ...
-
-    @property
-    def map(self) -> Any:
-        """The map of the main submap."""
-        ...
-
-    @property
-    def maps(self) -> Mapping[int, Any]:
-        """The map of each submap."""
-        ...
-
-    @property
-    def unjoined(self) -> Sequence[int]:
-        """The submaps whose place in the world of the main one is not known."""
-        ...
-
-    @property
-    def num_closures(self) -> int:
-        """Number of loops closed."""
-        ...
-
-    @property
-    def num_joins(self) -> int:
-        """Number of submaps joined with others."""
-        ...
-
-    @property
-    def keyframe_frames(self) -> Sequence[int] | None:
-        """The frame of each keyframe; None where nothing is remembered."""
-        ...
-
-    @property
-    def loops(self) -> Sequence[tuple[int, int]]:
-        """Pairs of keyframes that loops tie together."""
-        ...
+Outcome: TypeAlias = "Slam | FragmentsOutcome"
+"""What a run came to: a :class:`~scanweld.slam.system.Slam` that has seen all frames, or fragments put together."""
 
 
 def summarise(
