@@ -1,7 +1,7 @@
 """Mutation testing: small faults are put into the source one at a time, and the tests should notice each of them.
 
-    python benchmarks/mutation.py registration --sample 120 --out build/registration.md
-    python benchmarks/mutation.py fusion
+    python benchmarks/mutants.py registration --sample 120 --out build/registration.md
+    python benchmarks/mutants.py fusion
 
 By what they document, mutmut 3 wraps every function in a trampoline, which Numba cannot compile, and cosmic-ray runs
 all tests for each mutant; neither draws a sample. So this: mutants are drawn with a fixed seed; a first run notes which
