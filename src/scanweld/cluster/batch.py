@@ -156,7 +156,6 @@ class _Batch:
     waiting: deque[RunTask] = field(init=False)
     outcomes: dict[int, Outcome] = field(default_factory=dict)
     under_way: dict[Future, RunTask] = field(default_factory=dict)
-
     ranks: dict[int, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

@@ -320,10 +320,8 @@ class KeyframeLoopCloser(Stateful):
         poses, members = [keyframe.T_world_camera for keyframe in self.database.keyframes], self._members()
         old = np.stack([poses[index] for index in members])
         T_new_old = np.concatenate([found.T_world_keyframe @ se3.inverse(old[: len(then)]), old[len(then) :]])
-        place, before = (
-            {int(index): k for k, index in enumerate(members)},
-            {e.j: e.i for e in self._edges if not e.loop},
-        )
+        place = {int(index): k for k, index in enumerate(members)}
+        before = {edge.j: edge.i for edge in self._edges if not edge.loop}
         for k in range(len(then), len(members)):
             T_new_old[k] = T_new_old[place[before[int(members[k])]]]
         new = np.concatenate([found.T_world_keyframe, T_new_old[len(then) :] @ old[len(then) :]])
