@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from scanweld.cluster.scheduler import connected, load_distributed
+from scanweld.cluster.scheduler import CALM, connected, load_distributed
 from scanweld.errors import InvalidInputError, MissingDependencyError, OutputError
 
 if TYPE_CHECKING:
@@ -47,6 +47,17 @@ def test_worker_that_takes_the_place_of_a_lost_one_ignores_ctrl_c(client: Client
     later, ignores_ctrl_c = client.submit(process_and_ctrl_c, 2).result(timeout=120)
     assert later != process
     assert ignores_ctrl_c
+
+
+def settings_of_dask(_: int) -> dict[str, object]:
+    """Run in a worker: the settings that it was started with."""
+    import dask.config
+
+    return {name: dask.config.get(name) for name in CALM}
+
+
+def test_workers_do_not_look_at_themselves_all_the_time(client: Client) -> None:
+    assert client.submit(settings_of_dask, 0).result(timeout=60) == CALM
 
 
 def test_client_of_a_scheduler_that_is_there(client: Client) -> None:

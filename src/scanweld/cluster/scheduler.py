@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import logging
 import signal
 import threading
@@ -20,6 +21,15 @@ LOOPBACK = "127.0.0.1"
 
 CONNECT_S = 30.0
 """Seconds in which a scheduler has to answer."""
+
+CALM: dict[str, Any] = {
+    "distributed.worker.profile.enabled": False,
+    "distributed.worker.memory.monitor-interval": "500ms",
+    "distributed.admin.tick.interval": "500ms",
+    "distributed.admin.system-monitor.interval": "2s",
+}
+"""Settings of Dask for a scheduler and workers that are started here and that nobody looks at: by default each looks at
+itself a hundred times a second, on a core that a task could have (7 % of a machine with two)."""
 
 
 def load_distributed() -> Any:
@@ -107,8 +117,11 @@ def connected(
 
 @contextlib.contextmanager
 def _started_here(distributed: Any, options: dict[str, Any], timeout_s: float) -> Iterator[Client]:
+    import dask.config
+
     with contextlib.ExitStack() as stack:
         stack.enter_context(_quiet())
+        stack.enter_context(dask.config.set({} if options["scheduler_kwargs"]["dashboard"] else CALM))
         with _ctrl_c_ignored():
             cluster = distributed.LocalCluster(
                 host=LOOPBACK,
@@ -121,7 +134,7 @@ def _started_here(distributed: Any, options: dict[str, Any], timeout_s: float) -
             client = stack.enter_context(
                 _closed_in_the_end(distributed.Client(cluster, timeout=timeout_s, set_as_default=False))
             )
-            client.register_plugin(_deaf_to_ctrl_c(distributed))
+            client.register_plugin(_plugin(distributed))
             client.wait_for_workers(1, timeout=timeout_s)
         yield client
 
@@ -148,16 +161,19 @@ def _ctrl_c_ignored() -> Iterator[None]:
         signal.signal(signal.SIGINT, usual)
 
 
-def _deaf_to_ctrl_c(distributed: Any) -> Any:
-    """Return a plugin by which workers that take the place of lost ones ignore Ctrl-C, too."""
+def _plugin(distributed: Any) -> Any:
+    """Return a plugin of workers, of those that take the place of lost ones, too."""
 
-    class DeafToCtrlC(distributed.WorkerPlugin):  # type: ignore[misc]
-        name = "scanweld-ctrl-c"
+    class StartedHere(distributed.WorkerPlugin):  # type: ignore[misc]
+        name = "scanweld-started-here"
 
         def setup(self, worker: Any) -> None:
             signal.signal(signal.SIGINT, signal.SIG_IGN)
 
-    return DeafToCtrlC()
+        def teardown(self, worker: Any) -> None:
+            gc.freeze()  # what is left goes with the process: looking for garbage in it takes half a second
+
+    return StartedHere()
 
 
 @contextlib.contextmanager
