@@ -28,8 +28,8 @@ CALM: dict[str, Any] = {
     "distributed.admin.tick.interval": "500ms",
     "distributed.admin.system-monitor.interval": "2s",
 }
-"""Settings of Dask for a scheduler and workers that are started here and that nobody looks at: by default each looks at
-itself a hundred times a second, on a core that a task could have (7 % of a machine with two)."""
+"""Settings of Dask for a scheduler and workers that are started here: by default each looks at itself a hundred times a
+second, on a core that a task could have (7 % of a machine with two). The dashboard's page of profiles stays empty."""
 
 
 def load_distributed() -> Any:
@@ -121,7 +121,7 @@ def _started_here(distributed: Any, options: dict[str, Any], timeout_s: float) -
 
     with contextlib.ExitStack() as stack:
         stack.enter_context(_quiet())
-        stack.enter_context(dask.config.set({} if options["scheduler_kwargs"]["dashboard"] else CALM))
+        stack.enter_context(dask.config.set(CALM))
         with _ctrl_c_ignored():
             cluster = distributed.LocalCluster(
                 host=LOOPBACK,
