@@ -470,7 +470,7 @@ class TestPage:
 
     def test_scripts_and_style_are_in_the_package(self) -> None:
         names = {item.name for item in package_files("scanweld.report").iterdir()}
-        assert {"template.html", "report.css", "page.js", "charts.js", "viewer.js"} <= names
+        assert {"frame.html", "run.html", "report.css", "page.js", "charts.js", "viewer.js"} <= names
 
 
 def luminance(color: str) -> float:

@@ -6,11 +6,10 @@ import math
 import statistics
 from collections.abc import Iterator, Mapping, Sequence
 from html import escape
-from importlib.resources import files as package_files
 from typing import Any
 from urllib.parse import quote
 
-from scanweld.report.assembly import fill, policy
+from scanweld.report.assembly import make_document
 from scanweld.report.verdict import DOUBTFUL, HEADLINES, TRUSTWORTHY, UNTRUSTWORTHY
 from scanweld.report.words import count_of, length
 
@@ -37,16 +36,10 @@ def make_batch_page(name: str, rows: Sequence[Row], swept: Sequence[str], second
     swept : names of the settings that differ between runs
     seconds : that the batch took
     """
-    package = package_files("scanweld.report")
-    style = "".join(package.joinpath(part).read_text(encoding="utf-8") for part in ("report.css", "batch.css"))
-    script = package.joinpath("batch.js").read_text(encoding="utf-8")
     pictured = [row for row in rows if row["verdict"]]
-    return fill(
-        package.joinpath("batch.html").read_text(encoding="utf-8"),
+    return make_document(
+        "batch",
         {
-            "policy": escape(policy(style, script, images="'self' file:")),
-            "style": style,
-            "script": script,
             "name": escape(name),
             "subtitle": escape(_subtitle(rows, swept)),
             "verdict": _verdict(rows),
@@ -57,6 +50,10 @@ def make_batch_page(name: str, rows: Sequence[Row], swept: Sequence[str], second
             "maps": _maps(pictured),
             "maps_hidden": "" if pictured else "hidden",
         },
+        body="batch.html",
+        styles=["report.css", "batch.css"],
+        scripts=["batch.js"],
+        images="'self' file:",
     )
 
 

@@ -6,7 +6,6 @@ import base64
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape
-from importlib.resources import files as package_files
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ from scanweld.config import to_toml
 from scanweld.evaluation.trajectory_metrics import AteResult
 from scanweld.geometry import se3
 from scanweld.io.atomic import write_file
-from scanweld.report.assembly import fill, policy
+from scanweld.report.assembly import make_document
 from scanweld.report.charts import Chart, accuracy_charts, evaluate, tracking_charts
 from scanweld.report.run_files import RunFiles, poses_of_frames, read_run_files
 from scanweld.report.scene import display_frame, encode_scene, floats, select_points
@@ -89,15 +88,9 @@ def make_page(run: RunFiles) -> str:
         "charts": {chart.key: chart.data() for chart in (*accuracy, *tracking)},
         "scene": scene,
     }
-    package = package_files("scanweld.report")
-    style = package.joinpath("report.css").read_text(encoding="utf-8")
-    script = "\n".join(package.joinpath(name).read_text(encoding="utf-8") for name in SCRIPTS)
-    return fill(
-        package.joinpath("template.html").read_text(encoding="utf-8"),
+    return make_document(
+        "report",
         {
-            "policy": policy(style, script),
-            "style": style,
-            "script": script,
             "data": _as_json(data),
             "points": points,
             "name": escape(run.name),
@@ -118,6 +111,9 @@ def make_page(run: RunFiles) -> str:
             "warnings": _warnings(run.run),
             "environment": _environment(run),
         },
+        body="run.html",
+        styles=["report.css"],
+        scripts=SCRIPTS,
     )
 
 
