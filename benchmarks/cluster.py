@@ -34,9 +34,9 @@ from scanweld.cluster.observer import BatchObserver
 from scanweld.cluster.outcome import Outcome, State
 from scanweld.cluster.plan import plan_batch
 from scanweld.cluster.scheduler import connected
-from scanweld.cluster.storage import list_files
 from scanweld.cluster.task import RunTask, run_task
 from scanweld.runs.input import RunInput
+from scanweld.runs.storage.recordings import list_files
 from scanweld.slam.config import SlamConfig
 from scanweld.slam.warmup import compile_kernels
 

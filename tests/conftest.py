@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 from pathlib import Path
+from typing import Any
 
 import hypothesis
 import pytest
@@ -29,3 +30,12 @@ def shared_data() -> Path:
     if not folder.is_dir():
         pytest.skip(f"recorded sequences not found at {folder} (set SCANWELD_DATA)")
     return folder
+
+
+@pytest.fixture
+def bucket() -> Any:
+    """An empty file system behind URLs, memory://."""
+    files = pytest.importorskip("fsspec").filesystem("memory")
+    files.store.clear()
+    files.pseudo_dirs[:] = [""]
+    return files

@@ -16,11 +16,9 @@ import pytest
 import scanweld as sw
 from scanweld.cli.app import run
 from scanweld.cli.progress import BatchProgress
-from scanweld.cluster import storage
 from scanweld.cluster.batch import largest_first
 from scanweld.cluster.outcome import Outcome, State
 from scanweld.cluster.plan import names_of, parse_sweep, plan_batch
-from scanweld.cluster.storage import Copies, list_files
 from scanweld.cluster.table import rows_of, table_lines, write_table
 from scanweld.cluster.task import RunTask, run_task
 from scanweld.config import from_mapping, merge, parse_override
@@ -28,6 +26,8 @@ from scanweld.datasets.synthetic import RenderConfig, render_sequence
 from scanweld.errors import ConfigError, DatasetError, InvalidInputError, OutputError
 from scanweld.report.batch_page import make_batch_page
 from scanweld.runs.input import RunInput
+from scanweld.runs.storage import run_folders
+from scanweld.runs.storage.recordings import Copies, list_files
 from scanweld.slam.config import SlamConfig
 
 FRAMES = 6
@@ -174,15 +174,6 @@ class TestTask:
         assert run_task(task_of(desk, tmp_path), "b").reason == "ZeroDivisionError: division by zero"
 
 
-@pytest.fixture
-def bucket() -> Any:
-    """An empty file system in memory."""
-    files = fsspec.filesystem("memory")
-    files.store.clear()
-    files.pseudo_dirs[:] = [""]
-    return files
-
-
 class TestUrls:
     @pytest.mark.parametrize("kind", ["memory", "file"])
     def test_a_run_between_urls(self, desk: Path, tmp_path: Path, bucket: Any, kind: str) -> None:
@@ -204,7 +195,7 @@ class TestUrls:
         assert noted["input"] == source
         assert noted["files"]["number"] == len(list_files(str(desk)).sizes)
         assert files.exists(f"{root}/map.ply")
-        assert not files.exists(f"{root}/{storage.UPLOADING}")
+        assert not files.exists(f"{root}/{run_folders.UPLOADING}")
         assert run_task(task_of(source, out), "b").state is State.KEPT
         assert run_task(task_of(source, out, force=True), "b").state is State.DONE
 

@@ -10,11 +10,12 @@ import pytest
 
 from scanweld.cluster.outcome import State
 from scanweld.cluster.plan import plan_batch
-from scanweld.cluster.storage import list_files, write_to
 from scanweld.cluster.task import run_task
 from scanweld.datasets.synthetic import RenderConfig, render_sequence
 from scanweld.errors import DatasetError
 from scanweld.runs.input import RunInput
+from scanweld.runs.storage.recordings import list_files
+from scanweld.runs.storage.urls import write_to
 from scanweld.slam.config import SlamConfig
 
 pytest.importorskip("s3fs")

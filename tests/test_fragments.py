@@ -21,9 +21,10 @@ from scanweld.loop_closure.linking import common_motion
 from scanweld.loop_closure.search import Edge, tracked_edge
 from scanweld.runs.fragments import making
 from scanweld.runs.fragments.assembling import assemble
+from scanweld.runs.fragments.exchange import ENDING
 from scanweld.runs.fragments.making import Fragment
 from scanweld.runs.fragments.outcome import joined_results
-from scanweld.runs.fragments.run import ENDING, run_fragments
+from scanweld.runs.fragments.run import run_fragments
 from scanweld.runs.input import RunInput
 from scanweld.runs.repeat import repeat_run
 from scanweld.slam.motion import POSED

@@ -84,11 +84,11 @@ def batch(
     from scanweld.cluster.batch import ClusterOptions, run_batch
     from scanweld.cluster.plan import plan_batch
     from scanweld.cluster.scheduler import load_distributed
-    from scanweld.cluster.storage import join, name_of, write_to
     from scanweld.cluster.table import TABLE_FILE, load_pyarrow, rows_of, write_table
     from scanweld.report.batch_page import make_batch_page
     from scanweld.report.page import REPORT_FILE
     from scanweld.runs.input import RunInput
+    from scanweld.runs.storage.urls import join, name_of, write_to
     from scanweld.slam.warmup import compile_kernels
 
     load_distributed()

@@ -35,13 +35,15 @@ Option = typer.Option
 
 def slam(
     sequence: Annotated[
-        Path,
+        str,
         typer.Argument(
             help="Sequence: a folder or a recording (TUM, ScanNet, Record3D, a ROS bag, ...: see docs/formats.md), "
-            "or realsense: for a camera."
+            "also behind a URL (s3://, ..), or realsense: for a camera."
         ),
     ],
-    out: Annotated[Path | None, Option(help="Run folder. Default: runs/SEQUENCE-N.", metavar="RUN")] = None,
+    out: Annotated[
+        str | None, Option(help="Run folder; with --fragments also a URL. Default: runs/SEQUENCE-N.", metavar="RUN")
+    ] = None,
     format_name: Format = "auto",
     topics: Topics = None,
     camera: Camera = None,
@@ -99,6 +101,7 @@ def slam(
     from scanweld.runs.folder import next_run_folder
     from scanweld.runs.input import RunInput, collected_warnings
     from scanweld.runs.reopen import given_poses
+    from scanweld.runs.storage.urls import is_url
 
     if fragments is None and (scheduler is not None or workers is not None):
         raise typer.BadParameter("--scheduler and --workers are for --fragments N")
@@ -109,13 +112,15 @@ def slam(
     refused = [name for name, value in alone.items() if value not in (None, False)]
     if fragments is not None and refused:
         raise typer.BadParameter(f"--fragments: a run in fragments takes no {refused[0]}")
+    if fragments is None and out is not None and is_url(out):
+        raise typer.BadParameter("--out: a URL is for --fragments; `scanweld batch` writes other runs to URLs")
     settings = load_config(config, overrides or [])
-    source = RunInput(str(sequence), format_name, frames, scale, camera, depth_scale, topics)
+    source = RunInput(sequence, format_name, frames, scale, camera, depth_scale, topics)
     with collected_warnings() as warnings:
         opened = source.open()
     if resume and out is None:
         raise ConfigError("--resume: --out RUN has to say which run is to be continued")
-    folder = out or next_run_folder(opened.name)
+    place = out or str(next_run_folder(opened.name))
     poses_from = poses if poses in (None, "truth") else str(Path(poses).resolve())
     given = None if poses_from is None else given_poses(opened, poses_from)
     description = {
@@ -124,13 +129,13 @@ def slam(
     }  # fmt: skip
     if fragments is not None:
         summary = run_in_fragments(
-            source, settings, folder, fragments, scheduler=scheduler, workers=workers, threads=threads, force=force,
+            source, settings, place, fragments, scheduler=scheduler, workers=workers, threads=threads, force=force,
             resume=resume, tracked_only=tracked_only, description=description, started=started,
         )  # fmt: skip
-        return print_summary(summary, json_output=json_output)
+        return print_summary(summary, json_output=json_output, place=place)
     with opened_observers(opened.name, view=view, host=view_host, port=view_port, rerun=rerun) as observers:
         summary = run_with_progress(
-            opened, settings, folder, force=force, poses=given, threads=threads, tracked_only=tracked_only,
+            opened, settings, Path(place), force=force, poses=given, threads=threads, tracked_only=tracked_only,
             calibrate=calibrate, refine=refine, realtime=realtime, observers=observers.all, description=description,
             resume=resume, checkpoint_every_s=checkpoint_every, started=started,
         )  # fmt: skip
@@ -184,7 +189,7 @@ def run_with_progress(
 def run_in_fragments(
     source: RunInput,
     config: SlamConfig,
-    folder: Path,
+    out: str,
     number: int,
     *,
     scheduler: str | None,
@@ -195,11 +200,11 @@ def run_in_fragments(
     """Run a sequence in fragments with progress on standard error."""
     from scanweld.cli.progress import CountProgress
     from scanweld.cluster.executors import opened_executor
-    from scanweld.runs.folder import check_writable
     from scanweld.runs.fragments.run import run_fragments
+    from scanweld.runs.storage.run_folders import check_place
     from scanweld.slam.warmup import compile_kernels
 
-    check_writable(folder, force=options["force"])
+    check_place(out, force=options["force"])
     with CountProgress("fragments") as progress:
         compile_kernels(lambda part: progress.begin(f"compiling, once for this machine: {part}"))
 
@@ -211,20 +216,22 @@ def run_in_fragments(
         try:
             with opened_executor(scheduler, workers=workers) as executor:
                 return run_fragments(
-                    source.open, number, config, out=folder, executor=executor, threads=threads or 1, progress=told,
+                    source.open, number, config, out=out, executor=executor, threads=threads or 1, progress=told,
                     **options,
                 )  # fmt: skip
         except KeyboardInterrupt:
-            progress.begin(f"what is done is kept: the same command with --out {folder} --resume goes on from there")
+            progress.begin(f"what is done is kept: the same command with --out {out} --resume goes on from there")
             raise
 
 
-def print_summary(summary: RunSummary, *, json_output: bool) -> int:
-    """Print what a run came to and return its exit code."""
+def print_summary(summary: RunSummary, *, json_output: bool, place: str | None = None) -> int:
+    """Print what a run came to, and the place where it is if that is not in the summary; return its exit code."""
     if json_output:
         typer.echo(json.dumps(summary.metrics))
     else:
         typer.echo(summary_text(summary))
+        if place is not None and summary.folder is None:
+            typer.echo(f"{'written':<8} {place}")
     if summary.interrupted:
         return 130
     if not summary.trustworthy:

@@ -22,9 +22,9 @@ from typing import TYPE_CHECKING, Any
 from scanweld.cluster.observer import BatchObserver
 from scanweld.cluster.outcome import Outcome, State, failed
 from scanweld.cluster.scheduler import CONNECT_S, connected, load_distributed
-from scanweld.cluster.storage import list_files
 from scanweld.cluster.task import RunTask, at_work, run_task, topic_of
 from scanweld.errors import InvalidInputError, ScanweldError
+from scanweld.runs.storage.recordings import list_files
 
 if TYPE_CHECKING:
     from distributed import Client, Future

@@ -9,11 +9,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from scanweld.cluster.storage import is_url, join
 from scanweld.cluster.task import RunTask
 from scanweld.config import parse_override
 from scanweld.errors import ConfigError, InvalidInputError
 from scanweld.runs.input import RunInput
+from scanweld.runs.storage.urls import is_url, join
 from scanweld.slam.config import SlamConfig
 
 _UNFIT = re.compile(r"[^\w.,=+-]")  # for the name of a folder, on any system

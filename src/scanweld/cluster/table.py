@@ -7,10 +7,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from scanweld.cluster.outcome import Outcome, State
-from scanweld.cluster.storage import write_to
 from scanweld.cluster.task import RunTask
 from scanweld.errors import MissingDependencyError
 from scanweld.report.words import length
+from scanweld.runs.storage.urls import write_to
 
 TABLE_FILE = "batch.parquet"
 

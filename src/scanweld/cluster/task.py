@@ -10,18 +10,19 @@ import tempfile
 import time
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 from scanweld.cluster.outcome import LISTED, SMALL_FILES, Outcome, State, failed, is_finished, read_outcome
-from scanweld.cluster.storage import Copies, check_uploadable, is_url, list_files, read_back, upload
 from scanweld.errors import OutputError, ScanweldError
 from scanweld.geometry.frame import Frame
 from scanweld.parallel import set_num_threads
 from scanweld.runs.folder import CHECKPOINT
 from scanweld.runs.input import RunInput, collected_warnings
 from scanweld.runs.run import run_sequence
+from scanweld.runs.storage.recordings import copies, list_files, scratch
+from scanweld.runs.storage.run_folders import check_uploadable, upload
+from scanweld.runs.storage.urls import is_url, read_back
 from scanweld.slam.config import SlamConfig
 from scanweld.slam.system import Slam
 from scanweld.slam.warmup import compile_kernels
@@ -111,7 +112,7 @@ def _run(task: RunTask, batch: str, begun: float) -> Outcome:
     with contextlib.ExitStack() as stack:
         folder, there = Path(task.folder), Path(task.folder)
         if is_url(task.folder):
-            aside = Path(stack.enter_context(tempfile.TemporaryDirectory(dir=_scratch().name)))
+            aside = Path(stack.enter_context(tempfile.TemporaryDirectory(dir=scratch())))
             folder, there = aside / "run", aside / "there"
             there.mkdir()
             read_back(task.folder, SMALL_FILES, there)
@@ -126,7 +127,7 @@ def _run(task: RunTask, batch: str, begun: float) -> Outcome:
         set_num_threads(task.threads)
         watch.tell(doing="fetching" if is_url(task.source.input) else "opening")
         with collected_warnings() as warnings:
-            place = stack.enter_context(_copies().local(listing))
+            place = stack.enter_context(copies().local(listing))
             sequence = replace(task.source, input=str(place)).open()
         watch.total = len(sequence)
         try:
@@ -145,18 +146,6 @@ def _run(task: RunTask, batch: str, begun: float) -> Outcome:
             watch.tell(doing="uploading")
             upload(folder, task.folder)
         return read_outcome(task.number, folder, State.DONE, time.perf_counter() - begun)
-
-
-@cache
-def _scratch() -> tempfile.TemporaryDirectory[str]:
-    """Return the folder for what this process fetches and has not uploaded yet; it goes with the process."""
-    worker = _worker()
-    return tempfile.TemporaryDirectory(prefix="scanweld-", dir=worker and worker.local_directory)
-
-
-@cache
-def _copies() -> Copies:
-    return Copies(Path(_scratch().name))
 
 
 def _worker() -> Any:

@@ -14,6 +14,8 @@ from scanweld.datasets.base import RgbdSequence
 from scanweld.datasets.intrinsics import parse_intrinsics
 from scanweld.datasets.open import open_sequence
 from scanweld.datasets.realsense import LIVE
+from scanweld.runs.storage.recordings import local_place
+from scanweld.runs.storage.urls import is_url
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,7 +24,7 @@ class RunInput:
 
     Attributes
     ----------
-    input : a folder or file; "realsense:" for a camera; a URL of what is to be fetched before it can be opened
+    input : a folder or file; "realsense:" for a camera; a URL (s3://, ..) of what is fetched before it is opened
     format : a name of :data:`~.open.FORMATS`, or "auto"
     frames : "A:B" or "A:B:STEP", None: all
     scale : factor on the image size
@@ -45,9 +47,9 @@ class RunInput:
         return cls(**{item.name: run[item.name] for item in fields(cls) if run.get(item.name)})
 
     def open(self) -> RgbdSequence:
-        """Open the sequence; errors are those of :func:`~.open.open_sequence`."""
+        """Open the sequence; errors are those of :func:`~.open.open_sequence` and :func:`~.storage.local_place`."""
         return open_sequence(
-            self.input,
+            local_place(self.input),
             format=self.format,
             camera=parse_intrinsics(self.camera) if self.camera else None,
             depth_scale=self.depth_scale,
@@ -58,7 +60,7 @@ class RunInput:
 
     def described(self) -> dict[str, Any]:
         """Return what run.json holds of it: the place as it is found from any other folder."""
-        is_path = not self.input.startswith(LIVE) and "://" not in self.input
+        is_path = not self.input.startswith(LIVE) and not is_url(self.input)
         return {**asdict(self), "input": str(Path(self.input).resolve()) if is_path else self.input}
 
 

@@ -19,6 +19,7 @@ from scanweld.report.run_files import FrameTable, check_run_folder, poses_of_fra
 from scanweld.runs.calibrated import CalibratedSequence
 from scanweld.runs.folder import MARK
 from scanweld.runs.input import RunInput
+from scanweld.runs.storage.urls import is_url
 from scanweld.trajectory import Trajectory
 
 
@@ -91,13 +92,18 @@ def reopen_sequence(run: Mapping[str, Any]) -> RgbdSequence:
     return sequence
 
 
-def reopen_input(run: Mapping[str, Any]) -> RgbdSequence:
-    """Open the sequence of a run as the run began with it; parameters and errors as in :func:`reopen_sequence`."""
+def reopen_input(run: Mapping[str, Any], *, fetch: bool = False) -> RgbdSequence:
+    """Open the sequence of a run as the run began with it; parameters and errors as in :func:`reopen_sequence`.
+
+    One behind a URL is fetched only with `fetch`: who looks at a run folder of somebody else asks no server for that.
+    """
     if isinstance(run.get("render"), Mapping):  # a demo renders its sequence, and keeps what it rendered
         return SyntheticSequence(from_mapping(RenderConfig, run["render"], MARK))
-    place = Path(str(run.get("input") or ""))
-    if not run.get("input") or not place.exists():
-        raise DatasetError(f"the sequence of the run is not there any more: {run.get('input') or 'it has no path'}")
+    place = str(run.get("input") or "")
+    if is_url(place) and not fetch:
+        raise DatasetError(f"the sequence of the run is not on this machine: {place}")
+    if not is_url(place) and not (place and Path(place).exists()):
+        raise DatasetError(f"the sequence of the run is not there any more: {place or 'it has no path'}")
     return RunInput.of_run(run).open()
 
 

@@ -108,7 +108,7 @@ def _backend(name: object) -> Iterator[None]:
 def _input_of(run: Mapping[str, Any]) -> Iterator[RgbdSequence]:
     """Open the sequence of a run; that of a demo is rendered to files again, as the demo did."""
     if not isinstance(run.get("render"), Mapping):
-        yield reopen_input(run)
+        yield reopen_input(run, fetch=True)
         return
     with tempfile.TemporaryDirectory(prefix="scanweld-repeat-") as aside:
         place = Path(aside) / str(run.get("name") or "rendered")

@@ -42,9 +42,17 @@ class Block:
     z: int
 
     @property
-    def name(self) -> str:
-        """What its folder is called."""
+    def _folder(self) -> str:
         return f"{BLOCK_FOLDER}{self.component}-{self.x}-{self.y}-{self.z}"
+
+    def piece(self, number: int) -> str:
+        """Name in the exchange of what a piece, by number, has brought to it."""
+        return f"{self._folder}/piece-{number:06d}.npy"
+
+    @property
+    def fused(self) -> str:
+        """Name in the exchange of what it has become."""
+        return f"{self._folder}/fused.npy"
 
 
 def sort_into_blocks(place: Workplace, piece: Piece, number: int, *, last: bool) -> list[Block]:
@@ -72,9 +80,8 @@ def sort_into_blocks(place: Workplace, piece: Piece, number: int, *, last: bool)
             for k, corner in enumerate(corners.T.tolist()):
                 blocks.setdefault(Block(piece.component, *corner), []).append(rows[:, of_corner.reshape(-1) == k])
         for block, parts in blocks.items():
-            folder = place.folder / block.name
-            folder.mkdir(exist_ok=True)
-            np.save(folder / f"piece-{number:06d}.npy", np.concatenate(parts, axis=1))
+            with place.exchange.written(block.piece(number)) as path:
+                np.save(path, np.concatenate(parts, axis=1))
     return sorted(blocks)
 
 
@@ -84,10 +91,11 @@ def fuse_block(place: Workplace, block: Block, numbers: Sequence[int]) -> int:
     with limited_threads(place.threads):
         surfels = SurfelMap()
         for number in numbers:
-            surfels.pages.add(_load(place.folder / block.name / f"piece-{number:06d}.npy"))
+            surfels.pages.add(_load(place.exchange.read(block.piece(number))))
         if len(numbers) > 1:
             merge_maps(surfels, fusion.max_confidence, fusion.merging)
-        np.save(_fused(place, block), surfels.pages.rows_in(surfels.pages.live))
+        with place.exchange.written(block.fused) as path:
+            np.save(path, surfels.pages.rows_in(surfels.pages.live))
     return len(surfels)
 
 
@@ -102,11 +110,7 @@ def whole_map(place: Workplace, blocks: Sequence[Block]) -> SurfelMap:
 
 def _contents(place: Workplace, blocks: Sequence[Block]) -> Iterator[Float32]:
     for block in sorted(blocks):
-        yield _load(_fused(place, block))
-
-
-def _fused(place: Workplace, block: Block) -> Path:
-    return place.folder / block.name / "fused.npy"
+        yield _load(place.exchange.read(block.fused))
 
 
 def _load(path: Path) -> Float32:

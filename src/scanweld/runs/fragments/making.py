@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -26,6 +25,7 @@ from scanweld.mapping.mapper import SurfelMapper
 from scanweld.parallel import limited_threads
 from scanweld.runs.checkpoint import encoding, file
 from scanweld.runs.checkpoint.identity import identity_of
+from scanweld.runs.fragments.exchange import Exchange
 from scanweld.runs.summary import peak_rss_mb
 from scanweld.runs.walk import Tally, process_all
 from scanweld.slam.config import SlamConfig
@@ -43,6 +43,11 @@ FRAGMENT, KEYFRAMES = "fragment.swc", "keyframes.swc"
 
 FRAGMENT_FOLDER = "fragment-"
 """What the names of the folders of fragments begin with."""
+
+
+def _name(part: int, file_name: str) -> str:
+    """Return the name of a file of a fragment in the exchange."""
+    return f"{FRAGMENT_FOLDER}{part:04d}/{file_name}"
 
 
 class Fragment(Stateful):
@@ -95,18 +100,14 @@ class Workplace:
 
     Attributes
     ----------
-    folder : on a disk that all workers share
+    exchange : of all workers
     config : of the run
     threads : of each task
     """
 
-    folder: Path
+    exchange: Exchange
     config: SlamConfig
     threads: int = 1
-
-    def folder_of(self, part: int) -> Path:
-        """Return the folder of a fragment."""
-        return self.folder / f"{FRAGMENT_FOLDER}{part:04d}"
 
 
 def make_fragment(place: Workplace, open_sequence: OpenSequence, part: Part) -> int:
@@ -115,10 +116,9 @@ def make_fragment(place: Workplace, open_sequence: OpenSequence, part: Part) -> 
     A fragment that is there already, of the same frames, configuration and program, is left as it is.
     """
     sequence = select(open_sequence(), slice(part.start, part.stop))
-    folder, header = place.folder_of(part.index), identity_of(sequence, place.config, None)
-    if _is_there(folder, header):
+    header = identity_of(sequence, place.config, None)
+    if _is_there(place, part.index, header):
         return part.index
-    folder.mkdir(parents=True, exist_ok=True)
     with limited_threads(place.threads):
         compile_kernels(lambda _: None)
         slam, tally = build_slam(sequence.camera, place.config), Tally()
@@ -141,47 +141,49 @@ def make_fragment(place: Workplace, open_sequence: OpenSequence, part: Part) -> 
         made.median_depth_m, made.content = tally.median_depth_m, tally.content
         made.warnings = [f"{part}: {warning}" for warning in tally.warnings]
         for submap, surfels in slam.maps.items():
-            _write(folder / f"map-{submap}.swc", header, surfels)
-        _write(folder / KEYFRAMES, header, database)
+            _write(place, part.index, f"map-{submap}.swc", header, surfels)
+        _write(place, part.index, KEYFRAMES, header, database)
         made.peak_rss_mb = peak_rss_mb()
-        _write(folder / FRAGMENT, header, made)  # last: where it is, all is
+        _write(place, part.index, FRAGMENT, header, made)  # last: where it is, all is
     return part.index
 
 
 def read_fragment(place: Workplace, part: int) -> Fragment:
     """Return what the whole run has to know of a fragment."""
     fragment = Fragment()
-    _read(place.folder_of(part) / FRAGMENT, fragment)
+    _read(place, part, FRAGMENT, fragment)
     return fragment
 
 
 def read_keyframes(place: Workplace, part: int) -> KeyframeDatabase:
     """Return the keyframes of a fragment, in its own worlds."""
     database = KeyframeDatabase(place.config.loop_closing.places)
-    _read(place.folder_of(part) / KEYFRAMES, database)
+    _read(place, part, KEYFRAMES, database)
     return database
 
 
 def read_map(place: Workplace, part: int, submap: int) -> SurfelMapper:
     """Return the map of a submap of a fragment, and what shows it."""
     mapper = SurfelMapper(place.config.fusion, place.config.map)
-    _read(place.folder_of(part) / f"map-{submap}.swc", mapper.map)
+    _read(place, part, f"map-{submap}.swc", mapper.map)
     return mapper
 
 
-def _is_there(folder: Path, header: Mapping[str, Any]) -> bool:
+def _is_there(place: Workplace, part: int, header: Mapping[str, Any]) -> bool:
     try:
-        with file.CheckpointFile(folder / FRAGMENT) as stored:
+        with file.CheckpointFile(place.exchange.read(_name(part, FRAGMENT))) as stored:
             return stored.header == header
     except FileFormatError:
         return False
 
 
-def _write(path: Path, header: Mapping[str, Any], state: Stateful) -> None:
-    file.write(path, header, encoding.encode(state, Stateful))
+def _write(place: Workplace, part: int, name: str, header: Mapping[str, Any], state: Stateful) -> None:
+    with place.exchange.written(_name(part, name)) as path:
+        file.write(path, header, encoding.encode(state, Stateful))
 
 
-def _read(path: Path, state: Stateful) -> None:
+def _read(place: Workplace, part: int, name: str, state: Stateful) -> None:
+    path = place.exchange.read(_name(part, name))
     with file.CheckpointFile(path) as stored:
         try:
             encoding.restore(stored, state)

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-import shutil
 import struct
-import tempfile
 import time
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -17,8 +15,8 @@ from scanweld.datasets.base import LiveSequence, RgbdSequence
 from scanweld.datasets.images import explain_unusable_depth
 from scanweld.errors import DatasetError, InvalidInputError, OutputError
 from scanweld.runs.checkpoint.identity import fingerprint_of
-from scanweld.runs.folder import check_writable, write_folder
 from scanweld.runs.fragments.assembling import Assembly, assemble
+from scanweld.runs.fragments.exchange import opened_exchange
 from scanweld.runs.fragments.fusing import BLOCK_FOLDER, Block, fuse_block, sort_into_blocks, whole_map
 from scanweld.runs.fragments.linking import link_fragments
 from scanweld.runs.fragments.making import (
@@ -32,14 +30,13 @@ from scanweld.runs.fragments.making import (
 from scanweld.runs.fragments.outcome import FragmentsOutcome, joined_results
 from scanweld.runs.output import write_run
 from scanweld.runs.run import RunSummary
+from scanweld.runs.storage.run_folders import check_place, written_at
+from scanweld.runs.storage.urls import is_url
 from scanweld.runs.summary import peak_rss_mb, summarise
 from scanweld.slam.config import SlamConfig
 from scanweld.slam.motion import POSED
 from scanweld.slam.parts import Part, parts_of
 from scanweld.slam.submaps import main_submap
-
-ENDING = ".fragments"
-"""What the name of the folder beside a run ends in, where tasks leave what they hand to each other."""
 
 Progress = Callable[[str, int, int], None]
 """Is told what is being done, how much of it is, and of how much."""
@@ -50,7 +47,7 @@ def run_fragments(
     number: int,
     config: SlamConfig | None = None,
     *,
-    out: Path | None = None,
+    out: Path | str | None = None,
     force: bool = False,
     resume: bool = False,
     executor: Executor | None = None,
@@ -69,8 +66,8 @@ def run_fragments(
     open_sequence : opens the recording, here and in every task
     number : of fragments
     config : what to do; `fragments.*` says how they overlap
-    out : run folder; None writes nothing. What the tasks hand to each other lies beside it, in `OUT.fragments`, which
-        must be on a disk that all workers have, and goes when the run is there
+    out : run folder, path or URL (s3://, ..); None writes nothing. What the tasks hand to each other lies beside it, in
+        `OUT.fragments`, which all workers must reach, and goes when the run is there
     force : replace an existing run
     resume : go on with the fragments that an earlier run, which was interrupted, has left there
     executor : where tasks run; by default one after the other in this process
@@ -93,14 +90,19 @@ def run_fragments(
     config = config or SlamConfig()
     if config.loop_closer == "none":
         raise InvalidInputError("fragments: are tied together by their keyframes; set loop_closer = 'keyframes'")
+    out = None if out is None else str(out)
     if out is not None:
-        check_writable(out, force=force)
+        check_place(out, force=force)
     sequence = open_sequence()
     if isinstance(sequence, LiveSequence):
         raise InvalidInputError(f"{sequence.name}: a live camera cannot be run in fragments; record it first")
     parts = parts_of(len(sequence), number, config.fragments.overlap)
     with contextlib.ExitStack() as stack:
-        place = Workplace(stack.enter_context(_work_folder(out, resume=resume)), config, threads)
+        # Blocks are of poses that may be others now.
+        left = stack.enter_context(
+            opened_exchange(out, (FRAGMENT_FOLDER, BLOCK_FOLDER), kept=(FRAGMENT_FOLDER,) if resume else ())
+        )
+        place = Workplace(left, config, threads)
         executor = executor or stack.enter_context(ThreadPoolExecutor(max_workers=1))
         tasks = _Tasks(executor, place, progress or (lambda *_: None))
         links = tasks.make_and_link(open_sequence, parts)
@@ -122,12 +124,13 @@ def run_fragments(
                 "tracked_only": tracked_only, "fragments": in_fragments, "fingerprint": fingerprint,
                 "warnings": [*given.get("warnings", ()), *warnings],
             }  # fmt: skip
-            with write_folder(out, force=force) as aside:
+            with written_at(out, force=force) as aside:
                 write_run(
                     aside, outcome, sequence, config, metrics, error, tracked_only=tracked_only,
                     description=given, started=started,
                 )  # fmt: skip
-    return RunSummary(out, metrics, tuple(outcome.main_results), outcome.map)
+    folder = None if out is None or is_url(out) else Path(out)
+    return RunSummary(folder, metrics, tuple(outcome.main_results), outcome.map)
 
 
 class _Tasks:
@@ -241,22 +244,3 @@ def _described(
             warnings.append(f"{part}: connects to no fragment of the main map; its own is map-{components[0]}.ply")
     links = [{"fragments": [a, b], "edges": of, "kept": kept} for (a, b), (kept, of) in sorted(assembly.kept.items())]
     return {"parts": described, "links": links}, warnings
-
-
-@contextlib.contextmanager
-def _work_folder(out: Path | None, *, resume: bool) -> Iterator[Path]:
-    """Yield a folder for what tasks hand to each other; after an error it stays, for `resume`."""
-    if out is None:
-        with tempfile.TemporaryDirectory(prefix="scanweld-fragments-") as temporary:
-            yield Path(temporary)
-        return
-    folder = out.resolve().with_name(out.name + ENDING)
-    left = list(folder.iterdir()) if folder.exists() else []
-    if any(not path.name.startswith((FRAGMENT_FOLDER, BLOCK_FOLDER)) for path in left):
-        raise OutputError(f"{folder}: holds something else than fragments; choose another --out")
-    for path in left:
-        if not resume or path.name.startswith(BLOCK_FOLDER):  # blocks are of poses that may be others now
-            shutil.rmtree(path)
-    folder.mkdir(parents=True, exist_ok=True)
-    yield folder
-    shutil.rmtree(folder, ignore_errors=True)

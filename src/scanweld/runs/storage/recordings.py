@@ -1,50 +1,31 @@
-"""Recordings and run folders behind URLs: s3://, gs://, memory://, whatever fsspec reaches.
-
-A recording is copied whole to a folder of the machine that uses it, and a run folder from there to where it belongs.
-"""
+"""Recordings behind URLs: what files there are, and copies of them on the machine that opens them."""
 
 from __future__ import annotations
 
 import contextlib
 import hashlib
 import os
-import posixpath
 import shutil
+import sys
 import tempfile
 import threading
+from collections import OrderedDict
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 from scanweld.datasets.layout import path_inside
-from scanweld.errors import DatasetError, InvalidInputError, MissingDependencyError, OutputError, ScanweldError
-from scanweld.io.atomic import write_file
-from scanweld.runs.folder import MARK
+from scanweld.errors import DatasetError
+from scanweld.runs.storage.urls import faults_told, filesystem, is_url, join, name_of
 
 NOT_READ = (".zip", ".tar", ".gz", ".tgz", ".bz2", ".xz", ".7z", ".ply", ".obj", ".pcd", ".glb", ".stl", ".pdf", ".md")
 """Endings of files that lie beside recordings, and that no reader of sequences opens."""
 
+
 BAGS, IMAGES = (".bag", ".mcap", ".db3"), (".png", ".jpg", ".jpeg", ".depth")
 """A bag beside the images that were taken out of it is not read."""
-
-UPLOADING = "upload.part"
-"""Is in a run folder behind a URL while its files are on their way: there is no run.json then."""
-
-
-def is_url(place: str) -> bool:
-    """Whether a place is behind a URL, and no path."""
-    return "://" in place
-
-
-def join(place: str, name: str) -> str:
-    """Return the place of something within a folder, path or URL."""
-    return f"{place.rstrip('/')}/{name}" if is_url(place) else str(Path(place) / name)
-
-
-def name_of(place: str) -> str:
-    """Return the name of a folder or file: the last part of its path or URL."""
-    return posixpath.basename(place.rstrip("/")) if is_url(place) else Path(place).resolve().name
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,8 +95,8 @@ def _local_sizes(place: Path) -> dict[str, int]:
 
 
 def _remote_sizes(url: str) -> dict[str, int]:
-    with _faults_told(url, DatasetError):
-        files, root = _filesystem(url)
+    with faults_told(url, DatasetError):
+        files, root = filesystem(url)
         found = files.find(root, detail=True)
         root = root.rstrip("/")
         return {
@@ -123,44 +104,6 @@ def _remote_sizes(url: str) -> dict[str, int]:
             for path, entry in found.items()
             if entry["type"] == "file"
         }
-
-
-def _filesystem(url: str) -> tuple[Any, str]:
-    """Return the file system of a URL, and the path in it.
-
-    Raises
-    ------
-    MissingDependencyError
-        When fsspec, or the package by which it reaches this kind of storage, is not installed.
-    InvalidInputError
-        When it knows no such storage.
-    """
-    try:
-        from fsspec.core import url_to_fs
-    except ModuleNotFoundError:
-        raise MissingDependencyError("fsspec", "cluster") from None
-    try:
-        files, path = url_to_fs(url)
-    except ImportError as error:
-        raise InvalidInputError(f"{url}: {error}") from None  # "Install s3fs to access S3"
-    except ValueError as error:
-        raise InvalidInputError(f"{url}: no storage that fsspec knows ({error})") from None
-    files.invalidate_cache()  # what others wrote meanwhile counts
-    return files, str(path)
-
-
-@contextlib.contextmanager
-def _faults_told(url: str, kind: type[ScanweldError]) -> Iterator[None]:
-    """Turn what a storage raises, which may be of any class, into one line."""
-    try:
-        yield
-    except ScanweldError:
-        raise
-    except FileNotFoundError:
-        raise kind(f"{url}: no such file or folder") from None
-    except Exception as error:
-        told = str(error).splitlines()
-        raise kind(f"{url}: {told[0] if told else type(error).__name__}") from None
 
 
 @dataclass(slots=True)
@@ -221,11 +164,11 @@ class Copies:
 def _fetch(listing: Listing, place: Path) -> None:
     """Copy a recording; it is there whole or not at all."""
     with (
-        _faults_told(listing.place, DatasetError),
+        faults_told(listing.place, DatasetError),
         tempfile.TemporaryDirectory(prefix="part-", dir=place.parent) as aside,
     ):
         part = Path(aside) / place.name
-        files, root = _filesystem(listing.place)
+        files, root = filesystem(listing.place)
         names = list(listing.sizes)
         local = [part / name if name else part for name in names]
         for parent in {path.parent for path in local}:
@@ -238,75 +181,59 @@ def _fetch(listing: Listing, place: Path) -> None:
         part.rename(place)
 
 
-def read_back(url: str, names: Collection[str], folder: Path) -> None:
-    """Copy those of the named files of a folder behind a URL that are there.
+@cache
+def _scratch_folder() -> tempfile.TemporaryDirectory[str]:
+    return tempfile.TemporaryDirectory(prefix="scanweld-", dir=_disk_of_worker())
+
+
+def _disk_of_worker() -> str | None:
+    """Return where the worker of Dask keeps its files that this process is, None where it is none."""
+    if (distributed := sys.modules.get("distributed")) is None:
+        return None
+    try:
+        return str(distributed.get_worker().local_directory)
+    except ValueError:
+        return None
+
+
+def scratch() -> Path:
+    """Return the folder for what this process has of what is behind URLs; it goes with the process."""
+    return Path(_scratch_folder().name)
+
+
+@cache
+def copies() -> Copies:
+    """Return the copies of recordings that this process has."""
+    return Copies(scratch())
+
+
+HELD = 2
+"""Recordings opened by their URLs that a process keeps copies of: the last ones."""
+
+
+_held: OrderedDict[str, contextlib.ExitStack] = OrderedDict()
+
+
+_holding = threading.Lock()
+
+
+def local_place(place: str) -> str:
+    """Return where a recording can be opened: its own place where that is a path, else a copy of what is there now.
+
+    The copy stays until others have been asked for, or the process ends.
 
     Raises
     ------
-    OutputError
-        When the storage cannot be reached.
-    """
-    with _faults_told(url, OutputError):
-        files, root = _filesystem(url)
-        for name in names:
-            with contextlib.suppress(FileNotFoundError):
-                (folder / name).write_bytes(files.cat_file(f"{root}/{name}"))
-
-
-def check_uploadable(url: str) -> None:
-    """Raise OutputError before any work is done when a folder holds something that is no run, and must stay."""
-    with _faults_told(url, OutputError):
-        files, root = _filesystem(url)
-        names = {posixpath.relpath(path, root) for path in files.find(root)}
-    if names and not names & {MARK, UPLOADING}:
-        raise OutputError(f"{url}: is not empty and no run folder (no {MARK}); choose another --out")
-
-
-def upload(folder: Path, url: str) -> None:
-    """Copy a run folder to a URL, in place of one that is there.
-
-    run.json comes last, and that of a run in its place goes first: a folder with a run.json is a whole run at any time.
-
-    Raises
-    ------
-    OutputError
-        When it could not be written, or a file arrived with another size.
-    """
-    with _faults_told(url, OutputError):
-        files, root = _filesystem(url)
-        sizes = _local_sizes(folder)
-        before = [posixpath.relpath(path, root) for path in files.find(root)]
-        for parent in {posixpath.dirname(f"{root}/{name}") for name in sizes}:
-            files.makedirs(parent, exist_ok=True)
-        files.pipe_file(f"{root}/{UPLOADING}", b"")
-        for name in (MARK, *(name for name in before if name not in {*sizes, MARK, UPLOADING})):
-            if name in before:
-                files.rm_file(f"{root}/{name}")
-        last = [name for name in ("metrics.json", MARK) if name in sizes]
-        for names in ([name for name in sizes if name not in last], *([name] for name in last)):
-            files.put([str(folder / name) for name in names], [f"{root}/{name}" for name in names])
-            files.invalidate_cache()
-            arrived = {posixpath.relpath(path, root): entry for path, entry in files.find(root, detail=True).items()}
-            for name in names:
-                got = arrived[name]["size"] if name in arrived else 0
-                if got != sizes[name]:
-                    raise OutputError(f"{join(url, name)}: {got} bytes arrived of {sizes[name]}")
-        files.rm_file(f"{root}/{UPLOADING}")
-
-
-def write_to(place: str, content: bytes) -> None:
-    """Write a file, path or URL, whole or not at all where the storage can do that.
-
-    Raises
-    ------
-    OutputError
-        When it cannot be written.
+    DatasetError
+        When it could not be fetched.
     """
     if not is_url(place):
-        Path(place).parent.mkdir(parents=True, exist_ok=True)
-        write_file(Path(place), content)
-        return
-    with _faults_told(place, OutputError):
-        files, path = _filesystem(place)
-        files.makedirs(posixpath.dirname(path), exist_ok=True)
-        files.pipe_file(path, content)
+        return place
+    with _holding, contextlib.ExitStack() as stack:
+        copy = stack.enter_context(copies().local(list_files(place)))
+        if place in _held:
+            _held.pop(place).close()
+        _held[place] = stack.pop_all()
+        while len(_held) > HELD:
+            _held.popitem(last=False)[1].close()
+    return str(copy)

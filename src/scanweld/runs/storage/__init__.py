@@ -1,0 +1,1 @@
+"""Recordings and run folders on disks and behind URLs."""
