@@ -8,7 +8,7 @@ import pytest
 from scanweld.geometry import se3
 from scanweld.registration import residuals
 from scanweld.registration.local import kernels
-from scanweld.registration.robust import robust_kernel
+from scanweld.registration.robust import Barron, RobustKernel, robust_kernel
 
 THICKNESS = 1e-3
 
@@ -85,6 +85,27 @@ def reference_rows(pairs: Pairs, metric: int):
     return np.stack([np.column_stack([J, r]) for J, r in parts])
 
 
+def coloured_rows(pairs: Pairs, noise: np.ndarray, kernel: RobustKernel):
+    """Rows (2, N, 8), plane and colour, and their weights (2, N) in units of the geometric noise."""
+    rows = pairs.used
+    p, j = pairs.moved[rows], pairs.partner[rows]
+    grey, target_grey, gradients = pairs.colour
+    r, J = residuals.coloured(p, pairs.target[j], pairs.normals[j], gradients[j], target_grey[j] - grey[rows])
+    colour = np.column_stack([with_scale(J, J[:, :3], p), r])
+    both = np.stack([reference_rows(pairs, kernels.PLANE)[0], colour])
+    weights = [kernel.weight(both[k, :, 7] / noise[k]) * (noise[0] / noise[k]) ** 2 for k in range(2)]
+    return both, np.stack(weights)
+
+
+def test_moved_points_are_turned_and_shifted():
+    """x' = A x + t with A = 2 (a quarter turn about z) and t = (11, 20, 30), of the rows asked for only."""
+    points = np.array([[1.0, 2, 3], [4, 5, 6], [7, 8, 9]])
+    transform = np.array([[0.0, -2, 0, 11], [2, 0, 0, 20], [0, 0, 2, 30]])
+    moved = np.zeros((3, 3))
+    kernels.move_points(1, 3, points, transform, moved)
+    np.testing.assert_array_equal(moved, [[0, 0, 0], [1, 28, 42], [-5, 34, 48]])
+
+
 @pytest.mark.parametrize("metric", [kernels.POINT, kernels.PLANE, kernels.SYMMETRIC])
 @pytest.mark.parametrize("name", ["none", "huber", "cauchy", "geman_mcclure", "tukey", "welsch"])
 def test_sums_equal_the_reference(metric, name):
@@ -120,19 +141,10 @@ def test_generalised_rows_make_the_information_of_the_discs():
 
 def test_colour_rows_are_added_in_units_of_the_geometric_noise():
     pairs = Pairs(2)
-    noise = np.array([0.3, 0.7])
-    rows = pairs.used
-    p, j = pairs.moved[rows], pairs.partner[rows]
-    grey, target_grey, gradients = pairs.colour
-    r, J = residuals.coloured(p, pairs.target[j], pairs.normals[j], gradients[j], target_grey[j] - grey[rows])
-    columns = np.column_stack([with_scale(J, J[:, :3], p), r])
-    geometric = reference_rows(pairs, kernels.PLANE)[0]
-    kernel = robust_kernel("cauchy")
-    expected = (geometric * kernel.weight(geometric[:, 7] / noise[0])[:, None]).T @ geometric
-    weight = kernel.weight(r / noise[1]) * (noise[0] / noise[1]) ** 2
-    expected += (columns * weight[:, None]).T @ columns
-    full, _ = pairs.sums(kernels.COLOURED, np.zeros(0), noise, kernel.compiled(r))
-    np.testing.assert_allclose(full, expected, rtol=1e-10, atol=1e-9)
+    noise, kernel = np.array([0.3, 0.7]), robust_kernel("cauchy")
+    rows, weights = coloured_rows(pairs, noise, kernel)
+    full, _ = pairs.sums(kernels.COLOURED, np.zeros(0), noise, kernel.compiled(rows[1, :, 7]))
+    np.testing.assert_allclose(full, np.einsum("cna,cn,cnb->ab", rows, weights, rows), rtol=1e-10, atol=1e-9)
 
 
 @pytest.mark.parametrize("metric", [kernels.POINT, kernels.PLANE, kernels.SYMMETRIC, kernels.GENERALISED])
@@ -158,6 +170,26 @@ def test_scores_of_the_targets_add_up_to_the_gradient(metric):
     assert (by_target[unused] == 0).all()
     assert (by_source[pairs.partner < 0] == 0).all()
     np.testing.assert_allclose(scores(3, -(-len(target) // 3)), by_target[::3], rtol=1e-12)
+
+
+def test_scores_of_coloured_pairs_equal_the_reference():
+    """Both rows of a pair, each weighted by its own residual with a loss of two parameters, go to its target."""
+    pairs = Pairs(7)
+    noise, kernel = np.array([0.3, 0.7]), Barron(alpha=-1.5, c=0.8)
+    rows, weights = coloured_rows(pairs, noise, kernel)
+    weights = weights * pairs.weights[pairs.used]
+    bread = np.diag(np.arange(1.0, 8)) + 0.1
+    expected = np.zeros((len(pairs.target), 8))
+    scores = np.einsum("cn,cna,cn->na", weights, rows[:, :, :7], rows[:, :, 7])
+    leverages = np.einsum("cn,cna,ab,cnb->n", weights, rows[:, :, :7], bread, rows[:, :, :7])
+    np.add.at(expected, pairs.partner[pairs.used], np.column_stack([scores, leverages]))
+    target, *rest = pairs.arguments()
+    robust = np.array(kernel.compiled(rows[0, :, 7]), float)
+    found = np.zeros_like(expected)
+    kernels.add_scores(
+        kernels.COLOURED, 1, pairs.moved, pairs.partner, pairs.weights, target, *rest, noise, robust, bread, found
+    )
+    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("metric", [kernels.PLANE, kernels.GENERALISED, kernels.COLOURED])

@@ -434,6 +434,22 @@ def test_a_direction_that_no_edge_measures_makes_its_nodes_loose(direction):
     assert graph.optimise().status is Status.CONVERGED
 
 
+@pytest.mark.parametrize("few", [1, 2, 3])
+def test_a_long_loose_chain_is_named_beside_single_loose_nodes(few):
+    """Of a unit vector of free motions a node of the chain has one part in sqrt(1000), a single node all of it."""
+    d = np.array([0.6, 0, 0.8, 0, 0, 0])
+    blind = 100 * (np.eye(6) - np.outer(d, d))
+    graph = PoseGraph()
+    graph.add_node(np.eye(4))
+    for k in range(1, few + 1):
+        graph.add_node(shift(0, k))
+        graph.add_edge(0, k, shift(0, k), blind)
+    for k in range(1000):
+        graph.add_node(shift(0.1 * k))
+        graph.add_edge(few + k if k else 0, few + 1 + k, shift(0.1 if k else 0), 100 * np.eye(6) if k else blind)
+    assert graph.optimise().loose_nodes == tuple(range(1, few + 1001))
+
+
 def test_long_chains_are_not_taken_for_free_ones():
     graph = PoseGraph()
     for k in range(3000):

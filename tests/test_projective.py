@@ -83,6 +83,21 @@ class TestSums:
         blank = SurfaceLevel(SMALL, wall[..., 2], np.where(np.arange(8) > 2, 0, wall).astype(np.float32))
         assert step_at(np.eye(4), (point, straight), blank, 0.05).num_matched == 0
 
+    def test_shares_are_those_of_equal_parts_in_order(self) -> None:
+        """1000 points in 4 shares: points 0 to 249, 250 to 499, .. alone, and together all of them."""
+        source, target, T = random_source(5, 1000), random_target(6), se3.exp([0.03, -0.02, 0.05, 0.1, -0.05, 0.2])
+        config = ProjectiveConfig(min_cosine=0.0)
+        step = projective_step(*source, T, target, 0.15, config, np.zeros(3), 1.0, parts=4)
+        assert step.num_matched > 100
+        quarters = [
+            projective_step(*(a[:, k : k + 250].copy() for a in source), T, target, 0.15, config, np.zeros(3), 1.0)
+            for k in range(0, 1000, 250)
+        ]
+        H, g = (np.stack([getattr(one.equations, name) for one in quarters]) for name in ("information", "gradient"))
+        np.testing.assert_allclose(step.shares.information, H, rtol=1e-5, atol=1e-5 * H.max())
+        np.testing.assert_allclose(step.shares.gradient, g, rtol=1e-5, atol=1e-5 * np.abs(g).max())
+        np.testing.assert_allclose(step.equations.information, H.sum(axis=0), rtol=1e-5, atol=1e-5 * H.max())
+
     @pytest.mark.parametrize(("u", "v", "inside"), [
         (-0.49, 3, True), (-0.51, 3, False), (39.49, 3, True), (39.51, 3, False),
         (3, -0.49, True), (3, -0.51, False), (3, 29.49, True), (3, 29.51, False),
