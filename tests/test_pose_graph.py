@@ -450,6 +450,23 @@ def test_a_long_loose_chain_is_named_beside_single_loose_nodes(few):
     assert graph.optimise().loose_nodes == tuple(range(1, few + 1001))
 
 
+@pytest.mark.parametrize("turned", [[0.6, 0, 0.8, 0, 0, 0], [0.6, 0, 0, 0, 0.8, 0]])
+def test_what_is_loose_neither_hides_other_loose_nodes_nor_what_is_known(turned):
+    """Beside node 1, which is known as well as its edge, hang node 2, free along z, and 3 with 4, free along another
+    direction; both ways of being free are named, and node 1 keeps the covariance of its edge."""
+    graph = PoseGraph()
+    for k in range(5):
+        graph.add_node(shift(k))
+    graph.add_edge(0, 1, shift(1), 100 * np.eye(6))
+    graph.add_edge(1, 2, shift(1), 100 * np.diag([1, 1, 0, 1, 1, 1]))
+    graph.add_edge(1, 3, shift(2), 100 * (np.eye(6) - np.outer(turned, turned)))
+    graph.add_edge(3, 4, shift(1), 100 * np.eye(6))
+    result = graph.optimise(covariance_of=[1, 2, 4])
+    assert result.loose_nodes == (2, 3, 4)
+    np.testing.assert_allclose(result.covariance[0], 0.01 * np.eye(6), atol=1e-9)
+    assert np.isinf(np.diagonal(result.covariance[1:], axis1=1, axis2=2)).all()
+
+
 def test_long_chains_are_not_taken_for_free_ones():
     graph = PoseGraph()
     for k in range(3000):

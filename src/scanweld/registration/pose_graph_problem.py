@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -17,6 +18,7 @@ from scanweld.registration.block_system import HELD, BlockSystem
 _LEAST_DAMPING, _MOST_DAMPING = 1e-9, 1e9  # shares of the diagonal
 _FIRST_DAMPING = 1e-6
 _FREE_PIVOT = 1e-11  # of the scaled system; the weakest node of a chain of 10 000 has 1e-4
+_FREE_DIAGONAL = 1e-13  # what is added to a singular system
 _FREE_SHARE = 1e-2  # of the largest motion in a free direction, beyond which a node takes part in it
 
 
@@ -210,13 +212,10 @@ def free_nodes(problem: GraphProblem, poses: Float64, weights: Float64) -> Bool:
         return free
     scaled, scale = _scaled(problem, poses, weights)
     unknowns = np.flatnonzero(problem.slots >= 0)
-    if (scale == 0).any():
-        free[unknowns] = (system.to_nodes(scale) == 0).any(axis=1)[problem.slots[unknowns]]
+    free[unknowns] = (system.to_nodes(scale) == 0).any(axis=1)[problem.slots[unknowns]]
+    factors, regular = _factors(problem, scaled, scale)
+    if regular:
         return free
-    factors = system.factor(scaled)
-    if factors is not None and np.abs(factors.U.diagonal()).min() > _FREE_PIVOT:
-        return free
-    factors = system.factor(scaled, 1e-13)
     if factors is None:
         free[unknowns] = True
         return free
@@ -225,21 +224,22 @@ def free_nodes(problem: GraphProblem, poses: Float64, weights: Float64) -> Bool:
         motions, _ = np.linalg.qr(factors.solve(motions))
     still = np.linalg.norm(scaled @ motions, axis=0) < 1e-9
     size = np.linalg.norm(system.to_nodes(motions[:, still] if still.any() else motions[:, :1]), axis=(1, 2))
-    free[unknowns] = (size > _FREE_SHARE * size.max())[problem.slots[unknowns]]
+    free[unknowns] |= (size > _FREE_SHARE * size.max())[problem.slots[unknowns]]
     return free
 
 
 def node_covariances(problem: GraphProblem, poses: Float64, weights: Float64, nodes: Sequence[int]) -> Float64:
     """Return the marginal covariances (K, 6, 6) of nodes, left perturbation at the world's origin.
 
-    Zero for held nodes, and where the system is singular.
+    Zero for held nodes, and where the system cannot be factorised; of free nodes it says nothing.
     """
     system = problem.system
     result = np.zeros((len(nodes), 6, 6))
     factors = None
     if system.num_nodes:
         scaled, scale = _scaled(problem, poses, weights)
-        factors = system.factor(scaled) if (scale > 0).all() else None
+        factors, _ = _factors(problem, scaled, scale)
+        scale = np.where(scale > 0, scale, 1.0)
     if factors is None:
         return result
     for k, node in enumerate(nodes):
@@ -255,8 +255,20 @@ def node_covariances(problem: GraphProblem, poses: Float64, weights: Float64, no
     return result
 
 
+def _factors(problem: GraphProblem, scaled: sp.csc_matrix, scale: Float64) -> tuple[Any, bool]:
+    """Factorise the scaled system, ones in the place of unknowns of which no edge says anything; is the rest regular?
+
+    Where it is not, a little on the diagonal keeps its free motions finite and away from what is known.
+    """
+    silent = np.asarray(scale == 0, dtype=np.float64)
+    factors = problem.system.factor(scaled, silent)
+    if factors is not None and np.abs(factors.U.diagonal()).min() > _FREE_PIVOT:
+        return factors, True
+    return problem.system.factor(scaled, silent + _FREE_DIAGONAL), False
+
+
 def _scaled(problem: GraphProblem, poses: Float64, weights: Float64) -> tuple[sp.csc_matrix, Float64]:
-    """Return D^-1 H D^-1 with ones on its diagonal, and D."""
+    """Return D^-1 H D^-1 with ones on its diagonal, and D; zeros in both where no edge says anything."""
     residuals, between = problem.residuals(poses)
     first, second = problem.jacobians(residuals, between)
     matrix = problem.system.matrix(first, second, weights[:, None, None] * problem.information)
