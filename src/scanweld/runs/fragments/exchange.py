@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import shutil
 import tempfile
 import uuid
@@ -15,6 +16,8 @@ from pathlib import Path
 from scanweld.errors import OutputError
 from scanweld.runs.storage.recordings import scratch
 from scanweld.runs.storage.urls import get, is_url, join, names_in, put, remove
+
+logger = logging.getLogger(__name__)
 
 ENDING = ".fragments"
 """What the name of the folder beside a run ends in, where tasks leave what they hand to each other."""
@@ -101,4 +104,7 @@ def opened_exchange(out: str | None, names: Collection[str], *, kept: Collection
     for folder in sorted({name.split("/")[0] for name in left if not name.startswith(tuple(kept))}):
         remove(join(place, folder))
     yield Exchange(place)
-    remove(place)
+    try:
+        remove(place)
+    except OutputError as error:  # the run is there and complete
+        logger.warning("%s; it is of no use any more", error)
