@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from rendered import rendered
 from scanweld.errors import ConfigError, InvalidInputError
 from scanweld.geometry import se3
 from scanweld.geometry.point_cloud import PointCloud, voxel_downsample
@@ -332,6 +335,35 @@ class TestHonesty:
         result = icp(source, target, config=IcpConfig(max_iterations=1))
         assert result.status is Status.MAX_ITERATIONS
         assert "max_iterations" in result.note
+
+
+@lru_cache
+def two_scans() -> tuple[np.ndarray, np.ndarray]:
+    """Three thousand points (N, 3) each of a furnished room with Kinect noise, none of them in both."""
+    sequence = rendered("room", "kinect", 96, "sweep")
+    seen = []
+    for k in range(0, 96, 12):
+        frame = sequence.frames[k]
+        assert frame is not None
+        points = sequence.camera.back_project(frame.depth_m)[frame.depth_m > 0]
+        seen.append(se3.transform_points(sequence.ground_truth.T_world_camera[k], points))
+    points = np.concatenate(seen)
+    order = np.random.default_rng(0).permutation(len(points))
+    return points[order[:3000]], points[order[3000:6000]]
+
+
+@pytest.mark.parametrize("seed", range(0, 60, 2))
+def test_a_room_from_anywhere_is_placed_rightly_or_not_at_all(seed: int) -> None:
+    """Starts 0.6 to 3.1 rad and up to a metre off; some end where a wall crosses the furniture."""
+    source, target = two_scans()
+    rng = np.random.default_rng(seed)
+    axis, angle_rad = rng.normal(size=3), rng.uniform(0.6, 3.1)
+    turn = se3.exp(np.concatenate([np.zeros(3), angle_rad * axis / np.linalg.norm(axis)]))
+    centre = source.mean(axis=0)
+    moved = se3.transform_points(turn, source - centre) + centre + rng.normal(size=3) * 0.5
+    result = icp(moved, target)
+    error_m = np.sqrt(((se3.transform_points(result.T_target_source, moved) - source) ** 2).sum(axis=1).mean())
+    assert not result.status.success or error_m < 0.02
 
 
 class TestContract:
