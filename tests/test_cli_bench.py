@@ -156,6 +156,13 @@ class TestCommand:
         assert run(["bench", *arguments]) in (1, 2)
         assert capsys.readouterr().err
 
+    def test_a_plot_that_cannot_be_is_told_before_anything_is_measured(
+        self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        monkeypatch.setattr("scanweld.benchmarking.machine.measure_machine", lambda: pytest.fail("it was measured"))
+        assert run(["bench", "--plot", str(tmp_path / "speed")]) == 1
+        assert "must end in .png or .pdf or .svg, got a name without ending" in capsys.readouterr().err
+
 
 class TestWarmup:
     def test_says_whether_anything_was_compiled(

@@ -97,8 +97,7 @@ def test_errors_are_one_line(files: tuple[str, str], tmp_path: Path, capsys: pyt
     cases = [
         ([files[0], str(tmp_path / "none.txt")], "none.txt: no such file"),
         ([files[0], str(late)], "no timestamp of the estimate"),
-        ([*files, "--plot", str(tmp_path / "no/folder.png")], "the plot cannot be written"),
-        ([*files, "--plot", str(tmp_path / "plot.docx")], "the plot cannot be written"),
+        ([*files, "--plot", str(tmp_path / "no/folder.png")], "cannot be written"),
     ]
     for arguments, words in cases:
         assert run(["evaluate", *arguments]) == 1
@@ -107,6 +106,44 @@ def test_errors_are_one_line(files: tuple[str, str], tmp_path: Path, capsys: pyt
         assert err.startswith("error: ")
         assert words in err
         assert err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("plot.docx", "the name must end in .png or .pdf or .svg, got '.docx'"),
+        ("plot.raw", "the name must end in .png or .pdf or .svg, got '.raw'"),
+        ("plot", "the name must end in .png or .pdf or .svg, got a name without ending"),
+        ("folder", "is a folder; the name of a file must end in .png or .pdf or .svg"),
+        ("folder.png", "is a folder"),
+    ],
+)
+def test_a_plot_that_cannot_be_is_told_before_any_work(
+    tmp_path: Path, name: str, words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Neither trajectory is there: had one been opened, that would be told instead."""
+    for folder in ("folder", "folder.png"):
+        (tmp_path / folder).mkdir()
+    assert run(["evaluate", str(tmp_path / "a.txt"), str(tmp_path / "b.txt"), "--plot", str(tmp_path / name)]) == 1
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith(f"error: --plot {tmp_path / name}: ")
+    assert words in err
+    assert err.count("\n") == 1
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["folder", "folder.png"]
+
+
+def test_the_library_draws_the_documented_kinds_alone(files: tuple[str, str], tmp_path: Path) -> None:
+    from scanweld.errors import OutputError
+    from scanweld.evaluation.trajectory_metrics import ate
+    from scanweld.evaluation.trajectory_plot import plot_trajectory_error
+    from scanweld.io.trajectory_files import read_trajectory
+
+    result = ate(read_trajectory(files[0]), read_trajectory(files[1]))
+    for name in ("plot", "plot.raw"):
+        with pytest.raises(OutputError, match=r"must end in \.png or \.pdf or \.svg"):
+            plot_trajectory_error(result, tmp_path / name)
+        assert list(tmp_path.glob("plot*")) == []
 
 
 def test_help(capsys: pytest.CaptureFixture[str]) -> None:

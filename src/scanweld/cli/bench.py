@@ -57,7 +57,9 @@ def bench(
     """
     from scanweld.benchmarking.machine import measure_machine
     from scanweld.cli.image_size import parse_size
+    from scanweld.cli.outputs import check_file
     from scanweld.cli.progress import CountProgress
+    from scanweld.evaluation.trajectory_plot import FORMATS as PICTURES
     from scanweld.parallel import set_num_threads
     from scanweld.slam.warmup import compile_kernels
 
@@ -65,6 +67,8 @@ def bench(
         raise typer.BadParameter("--plot and --peer-python belong to `bench sizes`")
     if kind is Kind.SIZES and sequence is not None:
         raise typer.BadParameter("a sequence belongs to `bench stages`")
+    if plot is not None:
+        check_file("--plot", plot, PICTURES)
     chosen = [] if sizes is None else [parse_size(size) for size in sizes.split(",")]
     if threads is not None:
         set_num_threads(threads)

@@ -38,15 +38,17 @@ def evaluate(
     trajectory: it tells how good a map can be. RPE is the error of the motion from each frame to the next:
     it tells how much the tracking drifts. Poses are matched by time, at most 0.02 s apart.
     """
+    from scanweld.cli.outputs import check_file
     from scanweld.evaluation.trajectory_metrics import ate, rpe
+    from scanweld.evaluation.trajectory_plot import FORMATS, plot_trajectory_error
     from scanweld.io.trajectory_files import read_trajectory
 
+    if plot is not None:
+        check_file("--plot", plot, FORMATS)
     estimated, true = read_trajectory(estimate), read_trajectory(truth)
     absolute = ate(estimated, true, align=align.value)
     relative = rpe(estimated, true) if absolute.num_pairs > 1 else None
     if plot is not None:
-        from scanweld.evaluation.trajectory_plot import plot_trajectory_error
-
         plot_trajectory_error(absolute, plot, title=f"{estimate.name} against {truth.name}")
     figures = _figures(absolute, relative, len(estimated))
     if json_output:

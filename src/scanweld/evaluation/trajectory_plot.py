@@ -10,6 +10,9 @@ from scanweld.arrays import Float64
 from scanweld.errors import OutputError
 from scanweld.evaluation.trajectory_metrics import AteResult
 
+FORMATS = (".png", ".pdf", ".svg")
+"""Endings of the pictures that are drawn."""
+
 TRUTH_COLOR = "#8a8f98"
 ERROR_COLOR = "#2563eb"
 GRID_COLOR = "#e5e7eb"
@@ -26,6 +29,8 @@ def plot_trajectory_error(result: AteResult, path: Path, *, title: str = "") -> 
     OutputError
         When the file cannot be written or its format is not known.
     """
+    if path.suffix.lower() not in FORMATS:
+        raise OutputError(f"{path}: a picture's name must end in {' or '.join(FORMATS)}")
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.collections import LineCollection
     from matplotlib.figure import Figure

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import tempfile
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
@@ -126,6 +125,7 @@ def check_outputs(out: Path | None, plot: Path | None, inputs: tuple[Path | None
     """Raise OutputError before any work when an output would replace an input, or cannot be written."""
     if out is None and plot is None:
         return
+    from scanweld.cli.outputs import check_file
     from scanweld.errors import OutputError
     from scanweld.io.point_files import FORMATS as POINT_FORMATS
     from scanweld.registration.pictures import FORMATS as PICTURES
@@ -138,16 +138,7 @@ def check_outputs(out: Path | None, plot: Path | None, inputs: tuple[Path | None
             raise OutputError(
                 f"{option} {path}: is one of the inputs, which are never overwritten; choose another name"
             )
-        if path.suffix.lower() not in endings:
-            got = f"got '{path.suffix}'" if path.suffix else "got a name without ending"
-            raise OutputError(f"{option} {path}: the name must end in {' or '.join(endings)}, {got}")
-        if path.is_dir():
-            raise OutputError(f"{option} {path}: cannot be written: is a folder")
-        try:
-            with tempfile.TemporaryFile(dir=path.parent):
-                pass
-        except OSError as error:
-            raise OutputError(f"{option} {path}: cannot be written: {path.parent}: {error.strerror or error}") from None
+        check_file(option, path, endings)
     if out is not None and out.suffix.lower() in (".las", ".laz"):
         _check_laspy()
 
