@@ -237,8 +237,43 @@ class TestScene:
         write_run_folder(tmp_path, points=0)
         assert "All 0 surfels" in make_page(read_run_files(tmp_path))
 
+    @pytest.mark.parametrize(
+        ("doubtful", "most", "words"),
+        [
+            (0, 5_000, "All 3,000 surfels of the map are shown."),
+            (40, 5_000, "2,960 of 3,000 surfels are shown: 40 that were seen about once, mostly noise, are left out."),
+            (0, 1_000, r"[\d,]+ of 3,000 surfels are shown: they are thinned evenly to one in [\d.]+ m?m\."),
+            (
+                40,
+                1_000,
+                r"are shown: 40 that were .* are left out, the others are thinned evenly to one in [\d.]+ m?m\.",
+            ),
+        ],
+    )
+    def test_what_is_not_shown_is_told_with_why(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, doubtful: int, most: int, words: str
+    ) -> None:
+        run = read_run_files(write_run_folder(tmp_path, points=3_000))
+        confidence = run.surfels["confidence"].copy()
+        confidence[:doubtful] = 1.0
+        monkeypatch.setattr("scanweld.report.page.select_points", lambda columns: select_points(columns, most))
+        text = make_page(replace(run, surfels={**run.surfels, "confidence": confidence}))
+        assert re.search(words, text)
+        assert "one in 0 mm" not in text
+
 
 class TestCharts:
+    def test_the_size_at_the_last_frame_is_not_called_that_of_the_final_map(self, folder: Path) -> None:
+        """The last of 40 frames saw 3000 + 39 * 75 surfels."""
+        frames = read_frames(folder / "frames.csv")
+
+        def said(final: float | None) -> str:
+            charts = tracking_charts(frames, np.arange(COUNT), final_surfels=final)
+            return next(chart.summary for chart in charts if chart.key == "surfels")
+
+        assert said(5_000) == "5,925 surfels at the last frame, 5,000 in the final map"
+        assert said(5_925) == said(None) == "5,925 surfels at the last frame"
+
     def test_errors_are_those_of_the_evaluation(self, folder: Path) -> None:
         run = read_run_files(folder)
         error = evaluate(run.trajectory, run.truth)
@@ -457,6 +492,23 @@ class TestPage:
         assert "residual 0.010 m, usually below 0.0040 m" in page
         assert "Trustworthy with reservations" in page
         assert "The map from behind and above, in colour" in page
+
+    def test_frames_of_another_submap_are_counted_as_lost(self, tmp_path: Path) -> None:
+        """Five lost, and six tracked elsewhere, one of them found again there: 11 of 40 have no pose in this map."""
+        table = [row | {"submap": int(30 <= row["frame"] < 36)} for row in rows()]
+        table[31]["status"] = "relocalised"
+        text = make_page(read_run_files(write_run_folder(tmp_path, table=table, points=60)))
+        assert "<dd>28 <small>of 40</small>" in text  # one more is unreadable
+        assert "<dt>frames lost</dt><dd>11 <small>found again 1×, 6 of them in another submap</small>" in text
+
+    def test_a_run_in_fragments_says_so_in_words(self, tmp_path: Path, page: str) -> None:
+        links = [{"fragments": [0, 1], "edges": 30, "kept": 28}, {"fragments": [0, 2], "edges": 5, "kept": 0}]
+        fragments = {"parts": [{"frames": [0, 20]}, {"frames": [15, 30]}, {"frames": [25, 40]}], "links": links}
+        text = make_page(read_run_files(write_run_folder(tmp_path, points=60, run={"fragments": fragments})))
+        assert "made in fragments</th><td>3, tied together by 28 of 35 links between them</td>" in text
+        assert "fragments" not in re.sub(r"<script.*?</script>|<pre.*?</pre>", "", page, flags=re.DOTALL)
+        odd = make_page(read_run_files(write_run_folder(tmp_path, points=60, run={"fragments": {"parts": 3}})))
+        assert "made in fragments</th><td>{&quot;parts&quot;: 3}</td>" in odd
 
     def test_many_stretches_leave_the_longest(self, tmp_path: Path) -> None:
         table = rows(400)

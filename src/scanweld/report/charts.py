@@ -183,8 +183,11 @@ def _path_chart(error: AteResult) -> Chart:
     )
 
 
-def tracking_charts(frames: FrameTable, shown: Int64) -> list[Chart]:
-    """Return residual, overlap and inliers, time of each stage, and growth of the map."""
+def tracking_charts(frames: FrameTable, shown: Int64, *, final_surfels: float | None = None) -> list[Chart]:
+    """Return residual, overlap and inliers, time of each stage, and growth of the map.
+
+    The map that a run ends with has `final_surfels`: fragments and submaps are put together after the last frame.
+    """
     aligned = frames.aligned & (frames.inliers > 0)  # an alignment without a single match measured nothing
     # Lines go on level over dropped frames: single frames between them would be no line.
     dropped = np.array([state == "dropped" for state in frames.state])
@@ -211,7 +214,9 @@ def tracking_charts(frames: FrameTable, shown: Int64) -> list[Chart]:
     # The first frames compile or fill caches: they must not set the scale.
     taken_ms = total_ms[~dropped]
     steady = taken_ms[min(5, len(taken_ms) - 1) :]
-    grown = frames.surfels[-1]
+    grown = f"{frames.surfels[-1]:,.0f} surfels at the last frame"
+    if final_surfels is not None and final_surfels != frames.surfels[-1]:
+        grown += f", {final_surfels:,.0f} in the final map"
     return [
         Chart(
             key="rmse",
@@ -244,7 +249,7 @@ def tracking_charts(frames: FrameTable, shown: Int64) -> list[Chart]:
             title="Size of the map",
             about="It grows where the camera sees something new, and should stop growing where it returns. Growth on "
             "known ground means surfaces are doubled.",
-            summary=f"{grown:,.0f} surfels at the end",
+            summary=grown,
             series=[Series("surfels", frames.surfels[shown] / 1e3)],
             unit="thousand surfels",
         ),

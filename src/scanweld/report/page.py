@@ -81,7 +81,7 @@ def make_page(run: RunFiles) -> str:
     error = evaluate(run.trajectory, run.truth)
     verdict, stretches = judge(run.frames, run.metrics, run.run), find_stretches(run.frames)
     accuracy = accuracy_charts(run, error, shown) if error is not None else []
-    tracking = tracking_charts(run.frames, shown)
+    tracking = tracking_charts(run.frames, shown, final_surfels=run.metrics.get("num_surfels"))
     scene, points = _scene(run, shown, error)
     data = {
         "frames": _frame_data(run, shown),
@@ -197,9 +197,11 @@ def _tiles(run: RunFiles) -> str:
         tiles.append(("error of the path (ATE)", length(m["ate_rmse_m"]), f"at most {length(m['ate_max_m'])}"))
     if {"rpe_trans_m", "rpe_rot_deg"} <= m.keys():
         tiles.append(("error a frame (RPE)", length(m["rpe_trans_m"]), f"{m['rpe_rot_deg']:.3g}°"))
-    lost = run.frames.state.count("lost")
-    found = run.frames.state.count("relocalised")
-    tiles.append(("frames lost", f"{lost:,}", f"found again {found}×" if found else "" if lost else "never"))
+    kinds = kinds_of(run.frames)
+    found, elsewhere = kinds.count("relocalised"), kinds.count("elsewhere")
+    lost = kinds.count("lost") + elsewhere  # as metrics.json and the command line count them
+    more = [f"found again {found}×"] * (found > 0) + [f"{elsewhere:,} of them in another submap"] * (elsewhere > 0)
+    tiles.append(("frames lost", f"{lost:,}", ", ".join(more) if lost else "never"))
     tiles.append(("loops closed", f"{m.get('loop_closures', 0):,}", ""))
     input_points = m.get("num_points_input") or 0
     tiles.append(("surfels", f"{m.get('num_surfels', 0):,}", f"from {input_points / 1e6:,.1f} M points"))
@@ -216,10 +218,12 @@ def _tiles(run: RunFiles) -> str:
 def _map_note(scene: Mapping[str, Any]) -> str:
     if scene["count"] == scene["total"]:
         return f"All {scene['total']:,} surfels of the map are shown."
-    return (
-        f"{scene['count']:,} of {scene['total']:,} surfels are shown, thinned evenly to one in "
-        f"{length(scene['spacing'])}; map.ply has them all."
-    )
+    reasons = []
+    if scene["leftOut"]:
+        reasons.append(f"{scene['leftOut']:,} that were seen about once, mostly noise, are left out")
+    if scene["spacing"] > 0:
+        reasons.append(f"{'the others' if reasons else 'they'} are thinned evenly to one in {length(scene['spacing'])}")
+    return f"{scene['count']:,} of {scene['total']:,} surfels are shown: {', '.join(reasons)}. map.ply has them all."
 
 
 def _stretch_table(run: RunFiles, stretches: Sequence[Stretch]) -> str:
@@ -352,8 +356,11 @@ def _warnings(run: Mapping[str, Any]) -> str:
 
 
 def _environment(run: RunFiles) -> str:
-    told = {"warnings", "packages", "intrinsics", "name", "fingerprint"}
+    told = {"warnings", "packages", "intrinsics", "name", "fingerprint", "fragments"}
     rows = [(key, _value(value)) for key, value in run.run.items() if key not in told and value not in (None, [], "")]
+    fragments = run.run.get("fragments")
+    if fragments:
+        rows.append(("made in fragments", _fragments(fragments)))
     packages = run.run.get("packages")
     if isinstance(packages, dict):
         rows += [(str(key), str(value)) for key, value in packages.items()]
@@ -367,6 +374,16 @@ def _environment(run: RunFiles) -> str:
         rows.append(("seconds in all", f"{run.metrics['seconds_total']:.1f}"))
     body = "".join(f'<tr><th scope="row">{escape(key)}</th><td>{escape(value)}</td></tr>' for key, value in rows)
     return f'<div class="scroll" tabindex="0" role="region" aria-label="Environment"><table>{body}</table></div>'
+
+
+def _fragments(fragments: Any) -> str:
+    """Return how many fragments a run was made in and what ties them; as it is where it is not what a run writes."""
+    try:
+        number = len(fragments["parts"])
+        found, kept = (sum(link[key] for link in fragments["links"]) for key in ("edges", "kept"))
+    except (KeyError, TypeError):
+        return _value(fragments)
+    return f"{number}, tied together by {kept:,} of {count_of(found, 'link')} between them"
 
 
 def _value(value: Any) -> str:

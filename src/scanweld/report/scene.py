@@ -34,6 +34,7 @@ class Points:
     radius_m, confidence : (N,)
     spacing_m : that they were thinned to; 0 where all were kept
     total : how many points they stand for
+    left_out : how many of these were not looked at, since they were seen about once or are nowhere
     """
 
     position_m: Float64
@@ -43,6 +44,7 @@ class Points:
     confidence: Float64
     spacing_m: float
     total: int
+    left_out: int
 
 
 def select_points(columns: Mapping[str, Array], count: int = MAX_POINTS) -> Points:
@@ -77,6 +79,7 @@ def select_points(columns: Mapping[str, Array], count: int = MAX_POINTS) -> Poin
         confidence=confidence[chosen],
         spacing_m=spacing,
         total=total,
+        left_out=total - int(sound.sum()),
     )
 
 
@@ -164,6 +167,7 @@ def encode_scene(
         "low": low.tolist(),
         "high": high.tolist(),
         "inner": [inner_low.tolist(), inner_high.tolist()],
+        "leftOut": points.left_out,
         "spacing": points.spacing_m,
         "maxRadius": max_radius,
         "maxConfidence": max_confidence,
