@@ -16,7 +16,7 @@ import scanweld as sw
 from rendered import MemorySequence, rendered
 from scanweld.checkup.evidence import Pair, plan_bursts
 from scanweld.checkup.examine import examine, examine_input
-from scanweld.checkup.findings import FIGURES, WHY, Level
+from scanweld.checkup.findings import FIGURES, WHY, Checkup, Finding, Level
 from scanweld.checkup.first_look import FirstLook
 from scanweld.checkup.motions import Motion, check_focal_length, check_truth
 from scanweld.checkup.pictures import edge_spread
@@ -286,6 +286,26 @@ def test_command(tmp_path: Path, shown: Callable[..., tuple[int, str, str]]) -> 
     assert [finding["fault"] for finding in answer["findings"]] == ["negative-fy"]
     assert set(answer["findings"][0]) == {"fault", "level", "seen", "why", "advice"}
     assert (answer["frames"], answer["frames_looked_at"]) == (4, 4)
+
+
+@pytest.mark.parametrize(("columns", "fitted"), [("30", 40), ("40", 40), ("60", 60), ("80", 80), ("300", 120)])
+def test_command_keeps_to_the_terminal(
+    shown: Callable[..., tuple[int, str, str]], monkeypatch: pytest.MonkeyPatch, columns: str, fitted: int
+) -> None:
+    """Lines are as wide as the terminal, between 40 and 120 columns, and words are whole."""
+    advice = "pass the intrinsics of these images with --camera FX,FY,CX,CY, or --depth-scale 5000, or try --calibrate"
+    seen = "the same places seen from two directions fit together best with focal lengths half of those given " * 2
+    figures = dict.fromkeys(FIGURES, None) | {"median_depth_m": 1.234}
+    made = Checkup("room", 40, 40, (Finding("intrinsics", Level.ERROR, seen, advice),), figures)
+    monkeypatch.setattr("scanweld.checkup.examine.examine_input", lambda *_: made)
+    monkeypatch.setenv("COLUMNS", columns)
+    code, out, _ = shown("room")
+    assert code == 3
+    assert fitted - 12 <= max(map(len, out.splitlines())) <= fitted
+    words = out.split()
+    for text in (*seen.split(), *advice.split(), *" ".join(FIGURES.values()).split()):
+        assert text in words
+    assert "1.23" in words
 
 
 def test_command_without_a_recording(tmp_path: Path, shown: Callable[..., tuple[int, str, str]]) -> None:

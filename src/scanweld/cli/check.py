@@ -5,20 +5,21 @@ from __future__ import annotations
 import json
 import textwrap
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from scanweld.cli.sequence_options import Camera, DepthScale, Format, Frames, Topics
+from scanweld.cli.width import text_columns
 
 if TYPE_CHECKING:
     from scanweld.checkup.findings import Checkup
 
 Option = typer.Option
 
-COLUMNS = 100
+UNKNOWN = "not to be told"
 
 
 def check(
@@ -45,29 +46,42 @@ def check(
     if json_output:
         typer.echo(json.dumps({**checkup.as_dict(), "seconds": seconds}))
     else:
-        typer.echo("\n".join(_lines(checkup, seconds)))
+        typer.echo("\n".join(_lines(checkup, seconds, text_columns())))
     return 0 if checkup.sound else 3
 
 
-def _lines(checkup: Checkup, seconds: float) -> Iterator[str]:
+def _lines(checkup: Checkup, seconds: float, columns: int) -> Iterator[str]:
     """The findings, those that weigh most first, and what was measured, for a person."""
-    from scanweld.checkup.findings import FIGURES
-
     looked = f"looked at {checkup.num_looked_at} of {checkup.num_frames} frames in {seconds:.1f} s"
     if checkup.sound:
         verdict = "nothing wrong was found"
     else:
         count = len(checkup.findings)
         verdict = f"{count} thing{'s' * (count > 1)} to put right"
-    yield f"{checkup.name}: {verdict}" + (f" ({looked})" if checkup.num_frames else "")
+    heading = f"{checkup.name}: {verdict}" + (f" ({looked})" if checkup.num_frames else "")
+    yield from _wrapped(heading, columns, "  ")
     for finding in checkup.findings:
         yield ""
         yield f"{finding.level.value}: {finding.fault}"
         for name, text in (("seen", finding.seen), ("why", finding.why), ("do", finding.advice)):
-            yield textwrap.fill(text, COLUMNS, initial_indent=f"  {name:<5} ", subsequent_indent=" " * 8)
+            yield from _wrapped(f"  {name:<5} {text}", columns, " " * 8)
     if checkup.figures:
         yield ""
-        width = max(map(len, FIGURES.values()))
-        for name, words in FIGURES.items():
-            value = checkup.figures[name]
-            yield f"  {words:<{width}}  {'not to be told' if value is None else f'{value:.3g}'}"
+        yield from _table(checkup.figures, columns)
+
+
+def _table(figures: Mapping[str, float | None], columns: int) -> Iterator[str]:
+    """What was measured, a row each; words that have no room beside the figure go on below."""
+    from scanweld.checkup.findings import FIGURES
+
+    width = min(max(map(len, FIGURES.values())) + 2, columns - len(UNKNOWN) - 2)
+    for name, words in FIGURES.items():
+        value = figures[name]
+        first, *others = _wrapped(f"  {words}", width, " " * 4)
+        yield f"{first:<{width}}  {UNKNOWN if value is None else f'{value:.3g}'}"
+        yield from others
+
+
+def _wrapped(text: str, columns: int, indent: str) -> list[str]:
+    """Break a line between words alone: what is to be typed, or names a file, stays in one piece."""
+    return textwrap.wrap(text, columns, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
