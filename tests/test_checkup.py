@@ -151,6 +151,17 @@ def test_focal_length_that_makes_one_rigid_thing(factor: float, expected: float)
     assert figures["focal_factor"] == pytest.approx(expected, rel=0.04)
 
 
+@pytest.mark.parametrize(("factor", "beyond"), [(1.3, ""), (0.75, ""), (3.0, " or less"), (1 / 3.0, " or more")])
+def test_a_focal_length_beyond_those_tried_is_bounded_alone(factor: float, beyond: str) -> None:
+    """From 0.6 to 1.68 times the stated one is tried; the true one is a third, or three times as long."""
+    room = np.random.default_rng(0).uniform([-1, -0.8, 1.2], [1, 0.8, 3.5], (300, 3))
+    (finding,), figures = check_focal_length(CAMERA, CAMERA, views_of(room, factor))
+    found = figures["focal_factor"]
+    assert f"focal lengths {found:.2f} times those given{beyond}, fx" in finding.seen
+    about = f"(about {found * 260:.0f},{found * 260:.0f},159.5,119.5"
+    assert about + (f", FX and FY that{beyond})" if beyond else ")") in finding.advice
+
+
 def test_a_wall_fits_with_any_focal_length() -> None:
     """Lengths on it shrink alike in all views, and so do the errors of its features: that makes no lens better."""
     wall = np.random.default_rng(0).uniform([-1, -0.8, 2.0], [1, 0.8, 2.0], (300, 3))

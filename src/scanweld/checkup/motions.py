@@ -88,13 +88,16 @@ def check_focal_length(camera: PinholeCamera, stated: PinholeCamera, pairs: list
     saved = losses[FOCAL_FACTORS.index(1.0)] - losses.min()
     if max(factor, 1 / factor) < WRONG_FOCAL or saved < _LEAST_LOSS:
         return [], figures
+    # Where the best one tried is the last, a still better one may lie beyond it.
+    beyond = {0: " or less", len(losses) - 1: " or more"}.get(int(losses.argmin()), "")
     seen = (
         f"the same places seen from two directions fit together best with focal lengths {factor:.2f} times those "
-        f"given, fx {stated.fx:.1f} and fy {stated.fy:.1f}"
+        f"given{beyond}, fx {stated.fx:.1f} and fy {stated.fy:.1f}"
     )
+    about = f"{factor * stated.fx:.0f},{factor * stated.fy:.0f},{stated.cx:.1f},{stated.cy:.1f}"
     advice = (
-        f"pass the intrinsics of these images with --camera FX,FY,CX,CY (about {factor * stated.fx:.0f},"
-        f"{factor * stated.fy:.0f},{stated.cx:.1f},{stated.cy:.1f}), or try --calibrate"
+        f"pass the intrinsics of these images with --camera FX,FY,CX,CY (about {about}"
+        f"{', FX and FY that' + beyond if beyond else ''}), or try --calibrate"
     )
     return [Finding("intrinsics", Level.ERROR, seen, advice)], figures
 
