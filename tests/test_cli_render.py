@@ -75,3 +75,5 @@ def test_the_help_names_the_defaults_and_choices_of_the_configuration() -> None:
         assert f"Default: {defaults[key]}." in text
     for name in PATHS:
         assert name in text
+    assert defaults["frames"] == 0
+    assert "Default, or 0: one round" in text

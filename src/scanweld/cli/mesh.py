@@ -20,7 +20,7 @@ def mesh(
     ] = None,
     voxel: Annotated[
         float | None,
-        Option(help="Spacing of the grid in metres. Default: by pixels and noise at the usual depth.", min=0.0),
+        Option(help="Spacing of the grid in metres. Default, or 0: by pixels and noise at the usual depth.", min=0.0),
     ] = None,
     frames: Annotated[
         str | None, Option(help="Fuse these frames. Default: all that show something new.", metavar="A:B[:STEP]")

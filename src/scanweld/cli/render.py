@@ -33,7 +33,7 @@ def render(
         str | None, Option(help="none, kinect or realsense. Default: none.", autocompletion=noises)
     ] = None,
     frames: Annotated[
-        int | None, Option(help="Number of frames. Default: one round of a built-in path, all of a file.")
+        int | None, Option(help="Number of frames. Default, or 0: one round of a built-in path, all of a file.")
     ] = None,
     size: Annotated[str | None, Option(help="Image size. Default: 640x480.", metavar="WxH")] = None,
     fps: Annotated[float | None, Option(help="Frames per second. Default: 30.")] = None,
