@@ -7,13 +7,14 @@ import re
 import subprocess
 import sys
 from importlib.metadata import version
+from pathlib import Path
 from typing import Any
 
 import pytest
 import typer
 import typer.main
 
-from scanweld.cli.app import app
+from scanweld.cli.app import app, run
 from scanweld.cli.usage import in_plain_words
 
 OPTIONS = {
@@ -116,6 +117,44 @@ def test_wrong_usage_exits_2(arguments: list[str]) -> None:
     done = scanweld(*arguments)
     assert (done.returncode, done.stdout) == (2, "")
     assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        ("slam nowhere --frames a:b", "'--frames': expected A:B or A:B:STEP, for example 0:200 or 100::2, got 'a:b'"),
+        ("slam nowhere --frames 5", "got '5'"),
+        ("mesh nowhere --frames 0:x", "got '0:x'"),
+        ("check nowhere --camera 1,2,3", "'--camera': expected FX,FY,CX,CY, for example"),
+        ("batch nowhere --out no --topics /depth", "'--topics': expected depth=TOPIC"),
+        ("slam nowhere --set seed=1 --set seed", "--set seed: expected key=value"),
+        ("config show --set seed", "--set seed: expected key=value"),
+        ("register a b --set kernel", "--set kernel: expected key=value"),
+        ("register a b --voxel -1", "--voxel: expected a positive number of metres, got -1"),
+        ("render --out no --size 640", "expected WIDTHxHEIGHT, for example 640x480, got '640'"),
+        ("bench --sizes 64x48,80", "expected WIDTHxHEIGHT, for example 640x480, got '80'"),
+    ],
+)
+def test_a_value_of_another_form_is_wrong_usage(
+    arguments: str, told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Whatever the files hold: none of those named is there."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "200")
+    assert run(arguments.split()) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert told in err
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("arguments", ["slam nowhere --frames 0:5 --camera 1,2,3,4 --set seed=1", "mesh nowhere"])
+def test_values_of_the_right_form_leave_the_error_to_the_files(
+    arguments: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert run(arguments.split()) == 1
+    assert capsys.readouterr().err.startswith("error: nowhere: ")
 
 
 @pytest.mark.parametrize(

@@ -51,7 +51,6 @@ def test_a_path_file_is_followed(tmp_path: Path) -> None:
         (("--path", "missing.txt"), "no such file"),
         (("--path-frame", "up"), "expected one of cv, icl"),
         (("--noise", "lidar"), "expected one of none, kinect, realsense"),
-        (("--size", "640"), "expected WIDTHxHEIGHT"),
         (("--size", "0x480"), "width = 0"),
         (("--frames", "-1"), "frames = -1"),
     ],

@@ -221,7 +221,7 @@ class TestConfiguration:
         ("text", "told"),
         [
             ("tracking.stable_fraction=2", "0.001 to 1.0"), ("tracking.stable_fraction=lots", "expected float"),
-            ("tracking=3", "is a section"), ("seed", "key=value"), ("fusion.clean_interval=1.5", "expected int"),
+            ("tracking=3", "is a section"), ("fusion.clean_interval=1.5", "expected int"),
         ],
     )  # fmt: skip
     def test_wrong_value_is_told_in_a_line(
@@ -302,7 +302,7 @@ class TestBadInput:
     def test_unknown_format(self, scanweld: Callable[..., Answer], room: Path) -> None:
         self.told(scanweld("slam", room, "--format", "kitti"), "kitti", "redwood")
 
-    @pytest.mark.parametrize("frames", ["5", "9:3", "a:b", "100:"])
+    @pytest.mark.parametrize("frames", ["9:3", "100:"])
     def test_frames_that_are_none(self, scanweld: Callable[..., Answer], room: Path, frames: str) -> None:
         self.told(scanweld("slam", room, "--frames", frames), frames.rstrip(":"))
 

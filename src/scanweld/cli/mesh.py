@@ -10,6 +10,8 @@ from typing import Annotated
 
 import typer
 
+from scanweld.cli.sequence_options import FRAMES_FORM
+
 Option = typer.Option
 
 
@@ -23,7 +25,10 @@ def mesh(
         Option(help="Spacing of the grid in metres. Default, or 0: by pixels and noise at the usual depth.", min=0.0),
     ] = None,
     frames: Annotated[
-        str | None, Option(help="Fuse these frames. Default: all that show something new.", metavar="A:B[:STEP]")
+        str | None,
+        Option(
+            help="Fuse these frames. Default: all that show something new.", metavar="A:B[:STEP]", callback=FRAMES_FORM
+        ),
     ] = None,
     depth_max: Annotated[float | None, Option(help="Leave out depth beyond this, in metres.", min=0.1)] = None,
     fill_holes: Annotated[float, Option(help="Close holes with a border up to this long, in metres.", min=0.0)] = 0.0,

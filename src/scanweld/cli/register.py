@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from scanweld.cli.registration.options import Method
+from scanweld.cli.sequence_options import SET_FORM
 
 if TYPE_CHECKING:
     from scanweld.arrays import Float64
@@ -53,7 +54,11 @@ def register(
     ] = None,
     overrides: Annotated[
         list[str] | None,
-        Option("--set", help="Set one value of IcpConfig, for example kernel=tukey, locks=planar or min_overlap=0.1."),
+        Option(
+            "--set",
+            help="Set one value of IcpConfig, for example kernel=tukey, locks=planar or min_overlap=0.1.",
+            callback=SET_FORM,
+        ),
     ] = None,
     threads: Annotated[int | None, Option(min=1, help="Default: all cores. The result does not depend on it.")] = None,
     explain: Annotated[

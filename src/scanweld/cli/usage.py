@@ -4,7 +4,12 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
+from importlib import import_module
 from typing import Any
+
+import typer
+
+from scanweld.errors import ScanweldError
 
 WORDS = {
     "int_parsing": "expected a whole number",
@@ -21,6 +26,24 @@ def help_of(command: Callable[..., Any]) -> str:
     """Return the docstring of a command, a line for each paragraph: a terminal breaks lines where it ends."""
     paragraphs = inspect.cleandoc(command.__doc__ or "").split("\n\n")
     return "\n\n".join(" ".join(paragraph.split()) for paragraph in paragraphs)
+
+
+def well_formed(module: str, parser: str) -> Callable[..., Any]:
+    """Return a callback of an option that makes text which its parser refuses wrong usage.
+
+    The parser is loaded when there is text to parse; what it returns is left to the command.
+    """
+
+    def check(option: typer.CallbackParam, value: Any) -> Any:
+        texts = [value] if isinstance(value, str) else value or []
+        for text in texts:
+            try:
+                getattr(import_module(module), parser)(text)
+            except ScanweldError as error:
+                raise typer.BadParameter(str(error).removeprefix(f"{option.name}: ")) from None
+        return value
+
+    return check
 
 
 def in_plain_words(error: Exception) -> Exception:

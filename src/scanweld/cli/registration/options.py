@@ -115,10 +115,8 @@ def check_combination(
 
 def check_positive(option: str, value: float | None, most: float) -> None:
     """Refuse what is no length."""
-    from scanweld.errors import InvalidInputError
-
     if value is not None and not 0 < value <= most:
-        raise InvalidInputError(f"{option}: expected a positive number of metres, got {value:g}")
+        raise typer.BadParameter(f"{option}: expected a positive number of metres, got {value:g}")
 
 
 def check_outputs(out: Path | None, plot: Path | None, inputs: tuple[Path | None, ...]) -> None:
