@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
 
 from scanweld.arrays import Bool, Float32, Float64, UInt8
@@ -29,17 +31,28 @@ class ColorToDepth:
     def __init__(
         self, color_camera: PinholeCamera, depth_camera: PinholeCamera, T_color_depth: Float64 | None = None
     ) -> None:
-        self._shape = color_camera.shape
+        self._shape, self._depth_camera = color_camera.shape, depth_camera
         T = np.eye(4) if T_color_depth is None else T_color_depth
         self._same = np.abs(T - np.eye(4)).max() < _SAME and color_camera == depth_camera
         # A depth pixel covers this many colour pixels a side.
         finer = min(color_camera.fx / depth_camera.fx, color_camera.fy / depth_camera.fy)
         self._small = color_camera.scaled(1 / finer) if finer > 1 else color_camera
-        self._rays: Float64 = depth_camera.rays() @ T[:3, :3].T  # of the colour camera, for depth 1
+        self._turn: Float64 = T[:3, :3]
         self._shift_m: Float64 = T[:3, 3]
-        apart = np.abs(self._shift_m).max() > _SAME
-        self._map = None if apart else self._places(self._rays)
-        self._outside = None if self._map is None else self._is_outside(self._map)
+
+    # Tables are made with the first images, not before: the header of a damaged file may claim any size.
+    @cached_property
+    def _rays(self) -> Float64:
+        """Of the colour camera (H, W, 3), for depth 1."""
+        return np.asarray(self._depth_camera.rays() @ self._turn.T)
+
+    @cached_property
+    def _table(self) -> tuple[Float32, Bool] | None:
+        """Places and which are outside, where they do not depend on depth."""
+        if np.abs(self._shift_m).max() > _SAME:
+            return None
+        places = self._places(self._rays)
+        return places, self._is_outside(places)
 
     @property
     def color_shape(self) -> tuple[int, int]:
@@ -54,8 +67,9 @@ class ColorToDepth:
             return color
         if self._small.shape != color.shape[:2]:
             color = resize_color(color, self._small.shape)
-        places, outside = self._map, self._outside
-        if places is None or outside is None:
+        if self._table is not None:
+            places, outside = self._table
+        else:
             z = depth_m[..., None].astype(np.float64)
             places = self._places(np.where(z > 0, z * self._rays + self._shift_m, self._rays))
             outside = self._is_outside(places)
