@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 import sys
 import textwrap
 import time
@@ -30,9 +29,6 @@ if TYPE_CHECKING:
     from scanweld.cluster.task import RunTask
 
 Option = typer.Option
-
-NARROWEST, WIDEST = 40, 120
-"""Columns that the table has at least, and at most."""
 
 MOST_FAULTS = 12
 """Faults that are printed below the table; the page and the Parquet file have them all."""
@@ -81,6 +77,7 @@ def batch(
     begun = time.perf_counter()
     from scanweld.cli.progress import BatchProgress
     from scanweld.cli.slam import load_config
+    from scanweld.cli.width import text_columns
     from scanweld.cluster.batch import ClusterOptions, run_batch
     from scanweld.cluster.plan import plan_batch
     from scanweld.cluster.scheduler import load_distributed
@@ -115,8 +112,7 @@ def batch(
     if json_output:
         typer.echo(json.dumps({"runs": rows, "seconds": time.perf_counter() - begun}))
     else:
-        columns = min(max(shutil.get_terminal_size((100, 24)).columns, NARROWEST), WIDEST)
-        typer.echo("\n".join(_lines(tasks, outcomes, join(out, REPORT_FILE), columns)))
+        typer.echo("\n".join(_lines(tasks, outcomes, join(out, REPORT_FILE), text_columns())))
     if any(outcome.state == "interrupted" for outcome in outcomes):
         print("interrupted; the same command goes on from here", file=sys.stderr)
         return 130

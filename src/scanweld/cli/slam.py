@@ -230,6 +230,8 @@ def print_summary(summary: RunSummary, *, json_output: bool, place: str | None =
         typer.echo(json.dumps(summary.metrics))
     else:
         typer.echo(summary_text(summary))
+        if summary.folder is not None:
+            typer.echo(verdict_text(summary.folder))
         if place is not None and summary.folder is None:
             typer.echo(f"{'written':<8} {place}")
     if summary.interrupted:
@@ -243,6 +245,15 @@ def print_summary(summary: RunSummary, *, json_output: bool, place: str | None =
         )
         return 3
     return 0
+
+
+def verdict_text(folder: Path) -> str:
+    """Say what the report of a run says first."""
+    from scanweld.report.verdict import TRUSTWORTHY, judge_folder
+
+    verdict = judge_folder(folder)
+    why = "" if verdict.level == TRUSTWORTHY else f": {verdict.reasons[0]}"
+    return f"{'verdict':<8} {verdict.headline}{why}"
 
 
 def apart_text(metrics: Mapping[str, Any]) -> str:

@@ -7,11 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from scanweld.report.run_files import FrameTable
+from scanweld.report.run_files import FrameTable, read_frames, read_json
 from scanweld.report.stretches import kinds_of
 from scanweld.report.words import count_of, length, percent
 
@@ -84,6 +85,17 @@ def judge(frames: FrameTable, metrics: Mapping[str, Any], run: Mapping[str, Any]
     _judge_truth(case, metrics)
     _judge_circumstances(case, run)
     return case.verdict()
+
+
+def judge_folder(folder: Path) -> Verdict:
+    """Return what to think of the run in a folder.
+
+    Raises
+    ------
+    FileFormatError
+        When one of the files is missing, or cannot be read.
+    """
+    return judge(read_frames(folder / "frames.csv"), read_json(folder / "metrics.json"), read_json(folder / "run.json"))
 
 
 def _judge_tracking(case: _Case, frames: FrameTable) -> None:
