@@ -197,6 +197,20 @@ class TestCompleteOrAbsent:
         assert files_of(folder) == FILES
         assert [path.name for path in tmp_path.iterdir()] == ["run"]
 
+    def test_two_runs_at_once_into_one_folder(self, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+        """The one that ends later does not replace the other, and is not lost."""
+        sequence, folder = rendered(count=40).part(0, 3), tmp_path / "run"
+
+        def another(result: sw.FrameResult) -> None:
+            if result.index == 1:
+                sw.run_sequence(sequence.part(0, 2), out=folder)
+
+        summary = sw.run_sequence(sequence, out=folder, progress=another)
+        assert summary.folder == tmp_path / "run-1"
+        assert "another run was written there meanwhile; this one is in" in caplog.text
+        frames = [json.loads((place / "metrics.json").read_text())["frames"] for place in (folder, summary.folder)]
+        assert frames == [2, 3]
+
     def test_force_does_not_replace_something_else(self, tmp_path: Path) -> None:
         folder = tmp_path / "thesis"
         folder.mkdir()

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 from pathlib import Path
 
 from scanweld.errors import OutputError
 from scanweld.io import atomic, leftovers
+
+logger = logging.getLogger(__name__)
 
 KIND, MARK = "run folder", "run.json"
 
@@ -32,6 +35,15 @@ def check_writable(folder: Path, *, force: bool, resume: bool = False) -> None:
     if (folder / CHECKPOINT).is_file() and not (force or resume):
         raise OutputError(f"{folder}: holds a run that was interrupted; --resume continues it, --force begins anew")
     atomic.check_writable(folder, force=force or resume, kind=KIND, mark=_mark(folder))
+
+
+def still_free(folder: Path, *, force: bool) -> Path:
+    """Return the folder, or one beside it where another run was written to it since it was checked: none is lost."""
+    if force or not (folder / MARK).is_file():
+        return folder
+    other = next_run_folder(folder.name, folder.parent)
+    logger.warning("%s: another run was written there meanwhile; this one is in %s", folder, other)
+    return other
 
 
 def write_folder(folder: Path, *, force: bool) -> contextlib.AbstractContextManager[Path]:

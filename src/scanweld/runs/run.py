@@ -23,7 +23,7 @@ from scanweld.refinement.refine import Refinement
 from scanweld.runs.calibrated import CalibratedSequence
 from scanweld.runs.checkpoint.identity import fingerprint_of
 from scanweld.runs.checkpoint.keeper import Checkpoints
-from scanweld.runs.folder import check_writable, write_folder
+from scanweld.runs.folder import check_writable, still_free, write_folder
 from scanweld.runs.interrupts import Patience
 from scanweld.runs.observer import RunObserver
 from scanweld.runs.output import write_run
@@ -300,6 +300,7 @@ def run_sequence(
         metrics["seconds_total"] = time.perf_counter() - started
         resumable = False
         if out is not None:
+            out = still_free(out, force=force or resume)
             asked = {"calibrate": calibrate, "refine": refine, "realtime": realtime, "tracked_only": tracked_only}
             fingerprint = fingerprint_of(sequence, given) if timeless else {}
             with checkpoints.told_in_errors(), write_folder(out, force=force or resume) as aside:
