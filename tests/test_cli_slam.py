@@ -7,6 +7,7 @@ import json
 import logging
 import re
 import shutil
+import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -159,8 +160,31 @@ class TestRun:
         monkeypatch.setattr("scanweld.runs.output.write_ply", stop)
         code, out, err = scanweld("slam", room, "--out", "run")
         assert (code, out) == (130, "")
-        assert "nothing was written" in err
+        assert err.splitlines()[-1] == "interrupted"
         assert list(Path().iterdir()) == []
+
+    def test_second_ctrl_c_leaves_the_checkpoint_and_says_so(
+        self, scanweld: Callable[..., Answer], room: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """The first one is waiting for the end of the frame; the second one comes while the run is written."""
+        update = progress.FrameProgress.update
+
+        def ask(self: progress.FrameProgress, result: sw.FrameResult) -> None:
+            update(self, result)
+            if result.index == 3:
+                signal.raise_signal(signal.SIGINT)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(progress.FrameProgress, "update", ask)
+            patch.setattr("scanweld.runs.output.write_ply", lambda *_: signal.raise_signal(signal.SIGINT))
+            code, out, err = scanweld("slam", room, "--out", "run")
+        assert (code, out) == (130, "")
+        assert files_of(Path("run")) == {"checkpoint.swc"}
+        assert err.splitlines()[-1] == (
+            "interrupted; the last checkpoint is kept: the same command with --out run --resume goes on from there"
+        )
+        assert scanweld("slam", room, "--out", "run", "--resume")[0] == 0
+        assert files_of(Path("run")) == FILES
 
     def test_tracked_only(self, scanweld: Callable[..., Answer], tmp_path: Path) -> None:
         sequence = rendered(count=40).part(0, 6)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import lru_cache
@@ -16,6 +17,7 @@ import pytest
 import scanweld as sw
 from rendered import MemorySequence, blind, rendered, write_tum_folder
 from scanweld.cli import app as command_line
+from scanweld.cluster import executors
 from scanweld.geometry import se3
 from scanweld.loop_closure.linking import common_motion
 from scanweld.loop_closure.search import Edge, tracked_edge
@@ -291,6 +293,33 @@ class TestRun:
         dark = nothing.with_frames({k: blind(frame) for k, frame in enumerate(nothing.frames) if frame is not None})
         with pytest.raises(sw.DatasetError, match="no fragment has a frame with usable depth"):
             run_fragments(lambda: dark, 1, CONFIG)
+
+
+@pytest.mark.parametrize("finished", [0, 1])
+def test_interruption_says_what_is_kept(
+    finished: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Ctrl-C before the first fragment is finished, and in the second one."""
+    place = write_tum_folder(tmp_path / "room", walk().part(0, 60))
+
+    @contextlib.contextmanager
+    def in_this_process(*_: object, **__: object) -> Iterator[ThreadPoolExecutor]:
+        with ThreadPoolExecutor(1) as executor:
+            yield executor
+
+    def process_all(*arguments: object, **options: object) -> None:
+        if len(made) == finished:
+            raise KeyboardInterrupt
+        made.append(usual(*arguments, **options))
+
+    usual, made = making.process_all, []
+    monkeypatch.setattr(making, "process_all", process_all)
+    monkeypatch.setattr(executors, "opened_executor", in_this_process)
+    command = ["slam", str(place), "--out", str(tmp_path / "run"), "--fragments", "2", "--set", "fragments.overlap=12"]
+    assert command_line.run(command) == 130
+    resumed = f"the same command with --out {tmp_path / 'run'} --resume goes on from there"
+    kept = f"interrupted; 1 finished fragment is kept: {resumed}"
+    assert capsys.readouterr().err.splitlines()[-1] == (kept if finished else "interrupted")
 
 
 @pytest.mark.parametrize(

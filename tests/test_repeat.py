@@ -15,8 +15,9 @@ import scanweld as sw
 from rendered import rendered, write_tum_folder
 from scanweld.backends import get_backend
 from scanweld.cli.app import run
+from scanweld.cli.progress import FrameProgress
 from scanweld.cli.repeat import comparison_text
-from scanweld.errors import DatasetError, FileFormatError, InvalidInputError
+from scanweld.errors import DatasetError, FileFormatError, InvalidInputError, OutputError
 from scanweld.runs.comparison import Comparison, compare_runs
 from scanweld.runs.repeat import repeat_run
 
@@ -112,6 +113,34 @@ class TestRepeat:
         change(copy / "run.json", lambda content: content.update({key: True}))
         with pytest.raises(InvalidInputError, match=message):
             repeat_run(copy)
+
+    def test_interruption_leaves_what_was_there(
+        self, made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        """Nothing where there was nothing, and with --force the run that was to be replaced."""
+        update, command = FrameProgress.update, ["repeat", str(made / "run"), "--out", str(tmp_path / "again")]
+
+        def ask(self: FrameProgress, result: sw.FrameResult) -> None:
+            update(self, result)
+            if result.index == 3:
+                signal.raise_signal(signal.SIGINT)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(FrameProgress, "update", ask)
+            assert run(command) == 130
+            assert list(tmp_path.iterdir()) == []
+            assert capsys.readouterr().err.splitlines()[-1] == "interrupted"
+        assert run(command) == 0
+        with monkeypatch.context() as patch:
+            patch.setattr(FrameProgress, "update", ask)
+            assert run([*command, "--force"]) == 130
+        assert compare_runs(tmp_path / "again", made / "run").identical
+        assert [path.name for path in tmp_path.iterdir()] == ["again"]
+
+    def test_interrupted_run_is_not_replaced_unasked(self, made: Path, tmp_path: Path) -> None:
+        (tmp_path / "checkpoint.swc").touch()
+        with pytest.raises(OutputError, match=r"was interrupted; --force replaces it, --out writes elsewhere"):
+            repeat_run(made / "run", tmp_path)
 
     def test_not_over_itself(self, copy: Path) -> None:
         with pytest.raises(InvalidInputError, match="is the run that is to be repeated"):

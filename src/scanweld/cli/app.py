@@ -55,11 +55,16 @@ def _stoppable(command: Callable[..., int]) -> Callable[..., int]:
     def call(*arguments: Any, **options: Any) -> int:
         try:
             return command(*arguments, **options)
-        except KeyboardInterrupt:
-            print("interrupted; nothing was written", file=sys.stderr)
-            return 130
+        except KeyboardInterrupt as end:
+            return _interrupted(end)
 
     return call
+
+
+def _interrupted(end: BaseException) -> int:
+    """Say that a command was ended, and what the command itself knows of what it has kept; return the exit code."""
+    print(f"interrupted; {end}" if str(end) else "interrupted", file=sys.stderr)
+    return 130
 
 
 for command in (
@@ -114,9 +119,8 @@ def run(arguments: Sequence[str]) -> int:
     except ScanweldError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
-    except (KeyboardInterrupt, typer.Abort):
-        print("interrupted; nothing was written", file=sys.stderr)
-        return 130
+    except (KeyboardInterrupt, typer.Abort) as end:
+        return _interrupted(end)
     except BrokenPipeError:
         _drop_output()
         return 0

@@ -40,7 +40,8 @@ def demo(
             render_sequence(Path(folder) / "room", config, progress=progress.update)
         summary = run_with_progress(
             open_sequence(Path(folder) / "room"), SlamConfig(), out, threads=threads, force=force,
-            description={"input": "rendered room", "render": asdict(config.resolved())}, started=started,
+            resumable=False, description={"input": "rendered room", "render": asdict(config.resolved())},
+            started=started,
         )  # fmt: skip
     code = print_summary(summary, json_output=json_output)
     if not json_output:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -133,7 +134,10 @@ def slam(
             resume=resume, tracked_only=tracked_only, description=description, started=started,
         )  # fmt: skip
         return print_summary(summary, json_output=json_output, place=place)
-    with opened_observers(opened.name, view=view, host=view_host, port=view_port, rerun=rerun) as observers:
+    with (
+        kept_told(place, lambda: "" if realtime else checkpoint_kept(place)),
+        opened_observers(opened.name, view=view, host=view_host, port=view_port, rerun=rerun) as observers,
+    ):
         summary = run_with_progress(
             opened, settings, Path(place), force=force, poses=given, threads=threads, tracked_only=tracked_only,
             calibrate=calibrate, refine=refine, realtime=realtime, observers=observers.all, description=description,
@@ -186,6 +190,37 @@ def run_with_progress(
         return run_sequence(sequence, config, out=folder, progress=progress.update, started=started, **options)
 
 
+@contextlib.contextmanager
+def kept_told(place: str, kept: Callable[[], str]) -> Iterator[None]:
+    """Say, where Ctrl-C ends the block and something is `kept`, that --resume goes on from there."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        what = kept()
+        then = f"{what} kept: the same command with --out {place} --resume goes on from there" if what else ""
+        raise KeyboardInterrupt(then) from None
+
+
+def checkpoint_kept(place: str) -> str:
+    """Say that a run folder has a checkpoint, "" where it has none."""
+    from scanweld.runs.folder import CHECKPOINT
+
+    return "the last checkpoint is" if (Path(place) / CHECKPOINT).is_file() else ""
+
+
+def fragments_kept(place: str) -> str:
+    """Say how many fragments are finished beside a run folder, "" where none is, or nobody can say."""
+    from scanweld.errors import OutputError
+    from scanweld.runs.fragments.exchange import exchange_beside
+    from scanweld.runs.fragments.making import finished_in
+
+    try:
+        count = len(finished_in(exchange_beside(place)))
+    except OutputError:  # the storage does not answer, which may be why there was Ctrl-C
+        return ""
+    return "" if count == 0 else "1 finished fragment is" if count == 1 else f"{count} finished fragments are"
+
+
 def run_in_fragments(
     source: RunInput,
     config: SlamConfig,
@@ -205,7 +240,7 @@ def run_in_fragments(
     from scanweld.slam.warmup import compile_kernels
 
     check_place(out, force=options["force"])
-    with CountProgress("fragments") as progress:
+    with kept_told(out, lambda: fragments_kept(out)), CountProgress("fragments") as progress:
         compile_kernels(lambda part: progress.begin(f"compiling, once for this machine: {part}"))
 
         def told(what: str, done: int, total: int) -> None:
@@ -213,15 +248,10 @@ def run_in_fragments(
                 progress.begin(what)
             progress.update(done, total)
 
-        try:
-            with opened_executor(scheduler, workers=workers) as executor:
-                return run_fragments(
-                    source.open, number, config, out=out, executor=executor, threads=threads or 1, progress=told,
-                    **options,
-                )  # fmt: skip
-        except KeyboardInterrupt:
-            progress.begin(f"what is done is kept: the same command with --out {out} --resume goes on from there")
-            raise
+        with opened_executor(scheduler, workers=workers) as executor:
+            return run_fragments(
+                source.open, number, config, out=out, executor=executor, threads=threads or 1, progress=told, **options
+            )
 
 
 def print_summary(summary: RunSummary, *, json_output: bool, place: str | None = None) -> int:

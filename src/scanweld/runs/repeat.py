@@ -15,10 +15,10 @@ from scanweld.config import from_mapping, load_toml
 from scanweld.datasets.base import RgbdSequence
 from scanweld.datasets.open import open_sequence
 from scanweld.datasets.synthetic import RenderConfig, render_sequence
-from scanweld.errors import DatasetError, InvalidInputError
+from scanweld.errors import DatasetError, InvalidInputError, OutputError
 from scanweld.runs.checkpoint.identity import fingerprint_of
 from scanweld.runs.comparison import Comparison, compare_runs, differences_of_fingerprints
-from scanweld.runs.folder import MARK
+from scanweld.runs.folder import CHECKPOINT, MARK, write_folder
 from scanweld.runs.fragments.run import run_fragments
 from scanweld.runs.reopen import given_poses, read_description, reopen_input
 from scanweld.runs.run import Progress, poses_by_frame, run_sequence
@@ -38,7 +38,7 @@ def repeat_run(
     Parameters
     ----------
     folder : of the run
-    out : run folder of the repetition; None: a temporary one, which goes in the end
+    out : run folder of the repetition, which is there once it is complete; None: a temporary one, which goes in the end
     force : replace an existing run in `out`
     progress : called after each frame
 
@@ -70,27 +70,40 @@ def repeat_run(
         tracked_only = bool(run.get("tracked_only"))
         if isinstance(run.get("fragments"), Mapping):
             number = len(run["fragments"]["parts"])
-            run_fragments(
-                lambda: sequence, number, config, out=out, force=force, tracked_only=tracked_only,
-                description=description,
-            )  # fmt: skip
+            with _written_whole(out, force=force) as aside:
+                run_fragments(
+                    lambda: sequence, number, config, out=aside, tracked_only=tracked_only, description=description
+                )
             return compare_runs(out, folder)
-        summary = run_sequence(
-            sequence,
-            config,
-            out=out,
-            force=force,
-            poses=poses,
-            progress=progress,
-            calibrate=bool(run.get("calibrate")),
-            refine=bool(run.get("refine")),
-            tracked_only=tracked_only,
-            checkpoint_every_s=0.0,
-            description=description,
-        )
-        if summary.interrupted:
-            raise KeyboardInterrupt
+        with _written_whole(out, force=force) as aside:
+            summary = run_sequence(
+                sequence,
+                config,
+                out=aside,
+                poses=poses,
+                progress=progress,
+                calibrate=bool(run.get("calibrate")),
+                refine=bool(run.get("refine")),
+                tracked_only=tracked_only,
+                resumable=False,
+                description=description,
+            )
+            if summary.interrupted:
+                raise KeyboardInterrupt
         return compare_runs(out, folder)
+
+
+@contextlib.contextmanager
+def _written_whole(out: Path, *, force: bool) -> Iterator[Path]:
+    """Yield a folder for a run that becomes `out`; after an error or Ctrl-C it is gone, and `out` as it was."""
+    if (out / CHECKPOINT).is_file() and not force:
+        raise OutputError(f"{out}: holds a run that was interrupted; --force replaces it, --out writes elsewhere")
+    with write_folder(out, force=force) as aside:
+        made = aside / "run"
+        yield made  # within: what a run leaves beside its folder goes, too
+        for path in made.iterdir():
+            path.rename(aside / path.name)
+        made.rmdir()
 
 
 @contextlib.contextmanager

@@ -183,6 +183,7 @@ def run_sequence(
     clock: Clock | None = None,
     resume: bool = False,
     checkpoint_every_s: float | None = None,
+    resumable: bool = True,
     description: Mapping[str, Any] | None = None,
     started: float | None = None,
 ) -> RunSummary:
@@ -207,6 +208,7 @@ def run_sequence(
     resume : continue the run in `out` where its checkpoint is (docs/checkpoints.md), or begin where there is none
     checkpoint_every_s : seconds between two checkpoints, by default 60 or as many as keep their cost below 2 %; 0: none
         but when the run is interrupted. Runs in real time have none: they cannot be continued
+    resumable : False: no checkpoint is written, not when the run is interrupted either
     description : goes into run.json; its "warnings" are put before those of the run
     started : `time.perf_counter()` from which seconds_total counts; default now
 
@@ -263,7 +265,7 @@ def run_sequence(
         given = None if poses is None else poses_by_frame(sequence, poses)
         placed = _beside(config, out)
         run = _Run(sequence, placed, build_slam(sequence.camera, placed))
-        kept_in = out if timeless else None
+        kept_in = out if timeless and resumable else None
         checkpoints = Checkpoints(kept_in, sequence, config, given, every_s=checkpoint_every_s)
         if resume and checkpoints.resume(run):
             run.resumed_at.append(len(run.slam.results))
@@ -298,7 +300,7 @@ def run_sequence(
         run.check_map()
         metrics, error = summarise(run.slam, run.sequence.ground_truth, run.tally.num_points_input)
         metrics["seconds_total"] = time.perf_counter() - started
-        resumable = False
+        has_checkpoint = False
         if out is not None:
             out = still_free(out, force=force or resume)
             asked = {"calibrate": calibrate, "refine": refine, "realtime": realtime, "tracked_only": tracked_only}
@@ -308,9 +310,9 @@ def run_sequence(
                     aside, run.slam, run.sequence, config, metrics, error, tracked_only=tracked_only, started=started,
                     description=run.describe(description or {}, asked, fingerprint),
                 )  # fmt: skip
-                resumable = run.interrupted and checkpoints.keep_in(aside)
+                has_checkpoint = run.interrupted and checkpoints.keep_in(aside)
         results, refinements = tuple(run.slam.main_results), tuple(run.refinements)
-        return RunSummary(out, metrics, results, run.slam.map, run.interrupted, refinements, resumable)
+        return RunSummary(out, metrics, results, run.slam.map, run.interrupted, refinements, has_checkpoint)
 
 
 def _beside(config: SlamConfig, out: Path | None) -> SlamConfig:

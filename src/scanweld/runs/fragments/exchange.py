@@ -78,6 +78,11 @@ def _copies(_: str) -> _Copies:
     return _Copies()
 
 
+def exchange_beside(out: str) -> str:
+    """Return where the exchange of a run lies, beside its folder `out`, path or URL."""
+    return out.rstrip("/") + ENDING if is_url(out) else str(Path(out).resolve()) + ENDING
+
+
 @contextlib.contextmanager
 def opened_exchange(out: str | None, names: Collection[str], *, kept: Collection[str]) -> Iterator[Exchange]:
     """Yield the exchange of a run; it is removed in the end, and after an error it stays.
@@ -97,7 +102,7 @@ def opened_exchange(out: str | None, names: Collection[str], *, kept: Collection
         with tempfile.TemporaryDirectory(prefix="scanweld-fragments-") as temporary:
             yield Exchange(temporary)
         return
-    place = out.rstrip("/") + ENDING if is_url(out) else str(Path(out).resolve()) + ENDING
+    place = exchange_beside(out)
     left = names_in(place)
     if not all(name.startswith(tuple(names)) for name in left):
         raise OutputError(f"{place}: holds something else than fragments; choose another --out")

@@ -26,6 +26,7 @@ from scanweld.parallel import limited_threads
 from scanweld.runs.checkpoint import encoding, file
 from scanweld.runs.checkpoint.identity import identity_of
 from scanweld.runs.fragments.exchange import Exchange
+from scanweld.runs.storage.urls import names_in
 from scanweld.runs.summary import peak_rss_mb
 from scanweld.runs.walk import Tally, process_all
 from scanweld.slam.config import SlamConfig
@@ -146,6 +147,19 @@ def make_fragment(place: Workplace, open_sequence: OpenSequence, part: Part) -> 
         made.peak_rss_mb = peak_rss_mb()
         _write(place, part.index, FRAGMENT, header, made)  # last: where it is, all is
     return part.index
+
+
+def finished_in(exchange: str) -> list[int]:
+    """Return the numbers of the fragments that are finished in an exchange, path or URL.
+
+    Raises
+    ------
+    OutputError
+        When the storage cannot be reached.
+    """
+    folders = (name.removesuffix(f"/{FRAGMENT}") for name in names_in(exchange) if name.endswith(f"/{FRAGMENT}"))
+    numbers = (folder.removeprefix(FRAGMENT_FOLDER) for folder in folders if folder.startswith(FRAGMENT_FOLDER))
+    return sorted(int(number) for number in numbers if number.isdecimal())
 
 
 def read_fragment(place: Workplace, part: int) -> Fragment:
