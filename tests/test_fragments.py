@@ -232,12 +232,34 @@ class TestRun:
         with pytest.raises(sw.DatasetError, match="the disk is gone"):
             run_fragments(there_and_back, 3, CONFIG, out=tmp_path / "run")
         assert not (tmp_path / "run").exists()
+        with pytest.raises(sw.OutputError, match=r"run.fragments: holds 2 finished fragments .* --resume continues it"):
+            run_fragments(there_and_back, 3, CONFIG, out=tmp_path / "run")
         again = run_fragments(there_and_back, 3, CONFIG, out=tmp_path / "run", resume=True)
         assert len(made) == 4
         assert made[3] == made[2]
         assert run.folder is not None
         assert (run.folder / "map.ply").read_bytes() == (tmp_path / "run/map.ply").read_bytes()
         assert len(again.results) == COUNT
+
+    def test_fragments_of_other_frames_or_settings_are_named(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        """Of two fragments, 0 to 41 and 30 to 71 of 72 frames, the first is that of a run of frames 0 to 41 in one."""
+
+        def stopped(*_: object) -> None:
+            raise sw.DatasetError("stopped")
+
+        def make(count: int, number: int, config: sw.SlamConfig = CONFIG) -> str:
+            caplog.clear()
+            with pytest.raises(sw.DatasetError, match="stopped"):
+                run_fragments(lambda: walk().part(0, count), number, config, out=tmp_path / "run", resume=True)
+            return caplog.text
+
+        monkeypatch.setattr("scanweld.runs.fragments.run.assemble", stopped)
+        assert make(72, 2) == ""
+        assert make(72, 2) == ""
+        assert "of the fragments left there 1 is of other frames" in make(42, 1)
+        assert "of the fragments left there 0, 1 are of other frames" in make(72, 2, replace(CONFIG, seed=1))
 
     def test_folder_of_somebody_else_is_left_alone(self, tmp_path: Path) -> None:
         mine = tmp_path / f"run{ENDING}" / "thesis.txt"

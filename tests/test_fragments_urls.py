@@ -13,12 +13,13 @@ from rendered import rendered, write_tum_folder
 from scanweld.cli import app as command_line
 from scanweld.runs.fragments import making
 from scanweld.runs.fragments.exchange import ENDING, Exchange
+from scanweld.runs.fragments.making import Workplace, left_unfit
 from scanweld.runs.fragments.run import run_fragments
 from scanweld.runs.input import RunInput
 from scanweld.runs.reopen import reopen_input
 from scanweld.runs.repeat import repeat_run
 from scanweld.runs.storage.recordings import HELD, local_place
-from scanweld.slam.parts import FragmentConfig
+from scanweld.slam.parts import FragmentConfig, Part
 
 CONFIG = sw.SlamConfig(fragments=FragmentConfig(overlap=12))
 FILES = ("map.ply", "trajectory.txt", "keyframes.csv", "groundtruth.txt")
@@ -58,6 +59,8 @@ def test_same_bytes_behind_urls(
     with pytest.raises(sw.DatasetError, match="the storage is gone"):
         run_fragments(recording.open, 2, CONFIG, out=out)
     assert not bucket.exists("/lab/runs/room")
+    with pytest.raises(sw.OutputError, match="holds 1 finished fragment of a run that was interrupted; --resume"):
+        run_fragments(recording.open, 2, CONFIG, out=out)
     summary = run_fragments(recording.open, 2, CONFIG, out=out, resume=True, description=recording.described())
     assert made[1:] == [made[1]] * 2
     assert summary.folder is None
@@ -104,6 +107,15 @@ def test_what_somebody_else_has_behind_a_url_is_left_alone(room: Path, bucket: A
     with pytest.raises(sw.OutputError, match="something else than fragments"):
         run_fragments(RunInput(str(room)).open, 2, CONFIG, out="memory://lab/run", force=True)
     assert bucket.cat_file(f"/lab/run{ENDING}/thesis.txt") == b"years of work"
+
+
+def test_what_is_left_of_something_else_is_looked_at_and_not_kept(bucket: Any) -> None:
+    """A fragment that is made in its place has the same name."""
+    place, name = Workplace(Exchange("memory://lab/run.fragments"), CONFIG), "fragment-0000/fragment.swc"
+    bucket.pipe_file(f"/lab/run.fragments/{name}", b"of something else")
+    assert left_unfit(place, rendered(count=40), [Part(0, 0, 5, 0)]) == [0]
+    bucket.pipe_file(f"/lab/run.fragments/{name}", b"made anew")
+    assert place.exchange.read(name).read_bytes() == b"made anew"
 
 
 def test_copies_of_recordings_do_not_pile_up(room: Path, bucket: Any) -> None:

@@ -235,11 +235,10 @@ def run_in_fragments(
     """Run a sequence in fragments with progress on standard error."""
     from scanweld.cli.progress import CountProgress
     from scanweld.cluster.executors import opened_executor
-    from scanweld.runs.fragments.run import run_fragments
-    from scanweld.runs.storage.run_folders import check_place
+    from scanweld.runs.fragments.run import check_out, run_fragments
     from scanweld.slam.warmup import compile_kernels
 
-    check_place(out, force=options["force"])
+    check_out(out, force=options["force"], resume=options["resume"])
     with kept_told(out, lambda: fragments_kept(out)), CountProgress("fragments") as progress:
         compile_kernels(lambda part: progress.begin(f"compiling, once for this machine: {part}"))
 

@@ -6,8 +6,8 @@ themselves) and `map-K.swc` for each submap K, all in the format of checkpoints 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -116,8 +116,8 @@ def make_fragment(place: Workplace, open_sequence: OpenSequence, part: Part) -> 
 
     A fragment that is there already, of the same frames, configuration and program, is left as it is.
     """
-    sequence = select(open_sequence(), slice(part.start, part.stop))
-    header = identity_of(sequence, place.config, None)
+    whole = open_sequence()
+    sequence, header = select(whole, slice(part.start, part.stop)), _header(place, whole, part)
     if _is_there(place, part.index, header):
         return part.index
     with limited_threads(place.threads):
@@ -162,6 +162,17 @@ def finished_in(exchange: str) -> list[int]:
     return sorted(int(number) for number in numbers if number.isdecimal())
 
 
+def left_unfit(place: Workplace, sequence: RgbdSequence, parts: Sequence[Part]) -> list[int]:
+    """Return the numbers of fragments left there that are none of the run's: it has others in their place, or none."""
+    # With copies of its own where it is behind a URL: what is made anew has the same names.
+    seen = replace(place, exchange=Exchange(place.exchange.place))
+
+    def fits(number: int) -> bool:
+        return number < len(parts) and _is_there(seen, number, _header(place, sequence, parts[number]))
+
+    return [number for number in finished_in(place.exchange.place) if not fits(number)]
+
+
 def read_fragment(place: Workplace, part: int) -> Fragment:
     """Return what the whole run has to know of a fragment."""
     fragment = Fragment()
@@ -181,6 +192,11 @@ def read_map(place: Workplace, part: int, submap: int) -> SurfelMapper:
     mapper = SurfelMapper(place.config.fusion, place.config.map)
     _read(place, part, f"map-{submap}.swc", mapper.map)
     return mapper
+
+
+def _header(place: Workplace, whole: RgbdSequence, part: Part) -> Mapping[str, Any]:
+    """Return what a fragment is of."""
+    return identity_of(select(whole, slice(part.start, part.stop)), place.config, None)
 
 
 def _is_there(place: Workplace, part: int, header: Mapping[str, Any]) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import struct
 import time
 import zlib
@@ -16,7 +17,7 @@ from scanweld.datasets.images import explain_unusable_depth
 from scanweld.errors import DatasetError, InvalidInputError, OutputError
 from scanweld.runs.checkpoint.identity import fingerprint_of
 from scanweld.runs.fragments.assembling import Assembly, assemble
-from scanweld.runs.fragments.exchange import opened_exchange
+from scanweld.runs.fragments.exchange import exchange_beside, opened_exchange
 from scanweld.runs.fragments.fusing import BLOCK_FOLDER, Block, fuse_block, sort_into_blocks, whole_map
 from scanweld.runs.fragments.linking import link_fragments
 from scanweld.runs.fragments.making import (
@@ -24,6 +25,8 @@ from scanweld.runs.fragments.making import (
     Fragment,
     OpenSequence,
     Workplace,
+    finished_in,
+    left_unfit,
     make_fragment,
     read_fragment,
 )
@@ -37,6 +40,8 @@ from scanweld.slam.config import SlamConfig
 from scanweld.slam.motion import POSED
 from scanweld.slam.parts import Part, parts_of
 from scanweld.slam.submaps import main_submap
+
+logger = logging.getLogger(__name__)
 
 Progress = Callable[[str, int, int], None]
 """Is told what is being done, how much of it is, and of how much."""
@@ -68,8 +73,9 @@ def run_fragments(
     config : what to do; `fragments.*` says how they overlap
     out : run folder, path or URL (s3://, ..); None writes nothing. What the tasks hand to each other lies beside it, in
         `OUT.fragments`, which all workers must reach, and goes when the run is there
-    force : replace an existing run
-    resume : go on with the fragments that an earlier run, which was interrupted, has left there
+    force : replace an existing run, and what an interrupted one has left there
+    resume : go on with the fragments that an earlier run, which was interrupted, has left there; a warning names those
+        of other frames or settings
     executor : where tasks run; by default one after the other in this process
     threads : of each task
     tracked_only : leave lines of frames without a measured pose out of trajectory.txt
@@ -82,7 +88,8 @@ def run_fragments(
     InvalidInputError
         When there are too few frames for so many fragments, or the configuration remembers no keyframes.
     OutputError
-        When `out` cannot be written; checked before any frame is read.
+        When `out` cannot be written, or an interrupted run has left fragments there and neither `force` nor `resume`
+        says what is to become of them; checked before any frame is read.
     DatasetError
         When no frame has usable depth.
     """
@@ -92,7 +99,7 @@ def run_fragments(
         raise InvalidInputError("fragments: are tied together by their keyframes; set loop_closer = 'keyframes'")
     out = None if out is None else str(out)
     if out is not None:
-        check_place(out, force=force)
+        check_out(out, force=force, resume=resume)
     sequence = open_sequence()
     if isinstance(sequence, LiveSequence):
         raise InvalidInputError(f"{sequence.name}: a live camera cannot be run in fragments; record it first")
@@ -103,6 +110,11 @@ def run_fragments(
             opened_exchange(out, (FRAGMENT_FOLDER, BLOCK_FOLDER), kept=(FRAGMENT_FOLDER,) if resume else ())
         )
         place = Workplace(left, config, threads)
+        if resume and (unfit := left_unfit(place, sequence, parts)):
+            logger.warning(
+                "%s: of the fragments left there %s %s of other frames, settings or program, or damaged, and not used",
+                left.place, ", ".join(map(str, unfit)), "is" if len(unfit) == 1 else "are",
+            )  # fmt: skip
         executor = executor or stack.enter_context(ThreadPoolExecutor(max_workers=1))
         tasks = _Tasks(executor, place, progress or (lambda *_: None))
         links = tasks.make_and_link(open_sequence, parts)
@@ -131,6 +143,20 @@ def run_fragments(
                 )  # fmt: skip
     folder = None if out is None or is_url(out) else Path(out)
     return RunSummary(folder, metrics, tuple(outcome.main_results), outcome.map)
+
+
+def check_out(out: str, *, force: bool, resume: bool) -> None:
+    """Raise OutputError before any work is done when a run could not be written to `out` at the end, path or URL, or
+    would throw away unasked what an earlier one has finished."""
+    check_place(out, force=force)
+    if force or resume:
+        return
+    left = exchange_beside(out)
+    if count := len(finished_in(left)):
+        raise OutputError(
+            f"{left}: holds {count} finished fragment{'' if count == 1 else 's'} of a run that was interrupted; "
+            "--resume continues it, --force begins anew"
+        )
 
 
 class _Tasks:
