@@ -517,6 +517,11 @@ class TestFolder:
         with pytest.raises(OutputError, match="not a run folder"):
             sw.run_sequence(short(), out=tmp_path / "other", resume=True)
 
+    def test_interrupted_run_whose_checkpoint_is_gone(self, partial: Path) -> None:
+        (partial / CHECKPOINT).unlink()
+        with pytest.raises(InvalidInputError, match=r"was interrupted and has no checkpoint.*--force .* begins anew"):
+            sw.run_sequence(short(), out=partial, resume=True)
+
     def test_without_a_checkpoint_the_run_begins(self, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
         summary = sw.run_sequence(short().part(0, 3), out=tmp_path / "run", resume=True)
         assert len(summary.results) == 3

@@ -108,10 +108,15 @@ class TestRepeat:
         with pytest.raises(DatasetError, match="not there any more"):
             repeat_run(copy)
 
-    @pytest.mark.parametrize(("key", "message"), [("realtime", "real time"), ("interrupted", "--resume")])
+    @pytest.mark.parametrize(
+        ("key", "message"), [("realtime", "real time"), ("interrupted", "has no checkpoint, .* --force` begins anew")]
+    )
     def test_runs_without_a_second_time(self, copy: Path, key: str, message: str) -> None:
         change(copy / "run.json", lambda content: content.update({key: True}))
         with pytest.raises(InvalidInputError, match=message):
+            repeat_run(copy)
+        (copy / "checkpoint.swc").touch()
+        with pytest.raises(InvalidInputError, match="real time" if key == "realtime" else "--resume` ends it first"):
             repeat_run(copy)
 
     def test_interruption_leaves_what_was_there(

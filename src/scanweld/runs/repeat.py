@@ -55,7 +55,9 @@ def repeat_run(
     if run.get("realtime"):
         raise InvalidInputError(f"{folder}: was run in real time, and no two such runs are alike: it cannot be")
     if run.get("interrupted"):
-        raise InvalidInputError(f"{folder}: was interrupted; `scanweld slam .. --out {folder} --resume` ends it first")
+        slam, resumable = f"`scanweld slam .. --out {folder}", (folder / CHECKPOINT).is_file()
+        then = f"{slam} --resume` ends it first" if resumable else f"it has no checkpoint, {slam} --force` begins anew"
+        raise InvalidInputError(f"{folder}: was interrupted; {then}")
     config = from_mapping(SlamConfig, load_toml(folder / "config.toml"), str(folder / "config.toml"))
     with contextlib.ExitStack() as stack:
         if out is None:

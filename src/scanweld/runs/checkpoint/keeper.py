@@ -13,6 +13,7 @@ from scanweld.arrays import Float64
 from scanweld.datasets.base import RgbdSequence
 from scanweld.errors import DatasetError, FileFormatError, InvalidInputError, OutputError
 from scanweld.geometry.frame import Frame
+from scanweld.report.run_files import read_json
 from scanweld.runs.checkpoint import encoding, file
 from scanweld.runs.checkpoint.identity import check_frames, check_identity, digest_of, identity_of
 from scanweld.runs.folder import CHECKPOINT, MARK
@@ -65,14 +66,20 @@ class Checkpoints:
         FileFormatError
             When the checkpoint is damaged, or of another version.
         InvalidInputError, ConfigError
-            When it is of another sequence or configuration, or the run is finished.
+            When it is of another sequence or configuration, or there is none and the run was written.
         """
         if self.path is None:
             raise InvalidInputError("resume: there is no run folder to resume from")
         if not self.path.is_file():
-            if (self.path.parent / MARK).is_file():
-                raise InvalidInputError(f"{self.path.parent}: the run is finished, there is nothing to resume")
-            return False
+            folder = self.path.parent
+            if not (folder / MARK).is_file():
+                return False
+            if read_json(folder / MARK).get("interrupted"):
+                raise InvalidInputError(
+                    f"{folder}: was interrupted and has no checkpoint, it cannot be resumed; --force without --resume "
+                    "begins anew"
+                )
+            raise InvalidInputError(f"{folder}: the run is finished, there is nothing to resume")
         where = str(self.path)
         with file.CheckpointFile(self.path) as stored:
             check_identity(self._identity, stored.header, where)
