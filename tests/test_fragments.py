@@ -83,6 +83,18 @@ class TestParts:
         with pytest.raises(sw.InvalidInputError, match="at least 1"):
             parts_of(100, 0, 10)
 
+    @pytest.mark.parametrize(("number", "needed", "most"), [(2, 180, "1 fragment;"), (3, 420, "2 fragments;")])
+    def test_two_parts_have_one_neighbour_each(self, number: int, needed: int, most: str) -> None:
+        """60 are shared. Two parts: 60 alone, 60 shared, 60 alone. One between two others has 60 + 60 + 60, so that
+        parts begin 120 apart, and the last ends 60 later: 3 * 120 + 60. The ends then have 120 alone."""
+        parts = parts_of(needed, number, 60)
+        own = [len(part) - 60 * (2 if 0 < part.index < number - 1 else 1) for part in parts]
+        assert own == {2: [60, 60], 3: [120, 60, 120]}[number]
+        with pytest.raises(
+            sw.InvalidInputError, match=f"need {needed} frames; {needed - 1} frames make at most {most}"
+        ):
+            parts_of(needed - 1, number, 60)
+
 
 class TestCommonMotion:
     def test_is_the_mean_of_those_that_agree(self) -> None:

@@ -50,6 +50,9 @@ class Part:
 def parts_of(num_frames: int, number: int, overlap: int) -> list[Part]:
     """Cut a recording into so many parts of equal length; each shares frames with its neighbours and no others.
 
+    Each has at least as many frames of its own as it shares with a neighbour: with an overlap of V frames, N parts need
+    V (2 N + 1) frames; two, which have one neighbour each, 3 V.
+
     Raises
     ------
     InvalidInputError
@@ -59,11 +62,18 @@ def parts_of(num_frames: int, number: int, overlap: int) -> list[Part]:
         raise InvalidInputError(f"fragments: expected at least 1, got {number}")
     if number == 1:
         return [Part(0, 0, num_frames, 0)]
-    most = (num_frames - overlap) // (2 * overlap)
-    if number > most:
+    needed = _frames_needed(number, overlap)
+    if num_frames < needed:
+        most = max((num_frames - overlap) // (2 * overlap), 2 if num_frames >= _frames_needed(2, overlap) else 1)
         raise InvalidInputError(
-            f"fragments: {num_frames} frames make at most {max(most, 1)} fragments that share {overlap} frames with "
-            f"each neighbour and have as many of their own, got {number}; lower fragments.overlap, or the number"
+            f"fragments: {number} that share {overlap} frames with each neighbour and have as many of their own need "
+            f"{needed} frames; {num_frames} frames make at most {most} fragment{'' if most == 1 else 's'}; lower "
+            "fragments.overlap, or the number"
         )
     starts = [(num_frames - overlap) * k // number for k in range(number + 1)]
     return [Part(k, start, after + overlap, overlap if k else 0) for k, (start, after) in enumerate(pairwise(starts))]
+
+
+def _frames_needed(number: int, overlap: int) -> int:
+    """Return how many frames two or more parts need: a part between two others shares frames at both its ends."""
+    return overlap * (3 if number == 2 else 2 * number + 1)
