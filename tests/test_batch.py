@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import sys
 from dataclasses import replace
@@ -327,6 +328,9 @@ class TestTable:
         (tmp_path / "batch.parquet").mkdir()
         with pytest.raises(OutputError, match=r"batch\.parquet"):
             write_table(rows_of(*ended), str(tmp_path / "batch.parquet"))
+        (tmp_path / "file").touch()
+        with pytest.raises(OutputError, match=r"batch\.parquet: cannot be written: File exists"):
+            write_table(rows_of(*ended), str(tmp_path / "file" / "batch.parquet"))
 
 
 class TestPage:
@@ -379,6 +383,28 @@ class TestCommand:
         assert run(["batch", str(desk), "--out", str(tmp_path / "runs"), *arguments]) == 1
         assert told in capsys.readouterr().err.splitlines()[-1]
         assert not (tmp_path / "runs").exists()
+
+    def test_a_place_where_nothing_can_be_written_is_told_before_anything_runs(
+        self, desk: Path, tmp_path: Path, capsys: Any, monkeypatch: Any
+    ) -> None:
+        def refuse(*_: object, **__: object) -> None:
+            raise PermissionError(errno.EACCES, "Permission denied")
+
+        def told(place: Path) -> str:
+            assert run(["batch", str(desk), "--out", str(place)]) == 1
+            return str(capsys.readouterr().err)
+
+        monkeypatch.setattr("scanweld.cluster.batch.run_batch", lambda *_: pytest.fail("begins to work"))
+        file = tmp_path / "file"
+        file.write_text("mine")
+        assert told(file) == f"error: {file}: exists and is a file; choose another --out\n"
+        assert (
+            told(file / "runs") == f"error: {file / 'runs'}: cannot be written: Not a directory; choose another --out\n"
+        )
+        monkeypatch.setattr("tempfile.mkdtemp", refuse)
+        for name in ("runs", "."):
+            assert "cannot be written: Permission denied; choose another --out\n" in told(tmp_path / name)
+        assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
     def test_progress_in_a_pipe(self, capsys: Any) -> None:
         """A line for each that ended; word of what was before, which comes late, is not taken in."""

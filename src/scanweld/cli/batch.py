@@ -8,6 +8,7 @@ import textwrap
 import time
 from collections.abc import Iterator, Sequence
 from importlib.util import find_spec
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -82,10 +83,11 @@ def batch(
     from scanweld.cluster.plan import plan_batch
     from scanweld.cluster.scheduler import load_distributed
     from scanweld.cluster.table import TABLE_FILE, load_pyarrow, rows_of, write_table
+    from scanweld.io.atomic import check_holds
     from scanweld.report.batch_page import make_batch_page
     from scanweld.report.page import REPORT_FILE
     from scanweld.runs.input import RunInput
-    from scanweld.runs.storage.urls import join, name_of, write_to
+    from scanweld.runs.storage.urls import is_url, join, name_of, write_to
     from scanweld.slam.warmup import compile_kernels
 
     load_distributed()
@@ -101,6 +103,8 @@ def batch(
         checkpoint_every_s=checkpoint_every,
         description={"config": str(config) if config else None, "set": given},
     )  # fmt: skip
+    if not is_url(out):
+        check_holds(Path(out))
     with BatchProgress([task.name for task in tasks]) as progress:
         if scheduler is None:  # all at once would compile the same
             compile_kernels(lambda part: progress.say(f"compiling, once for this machine: {part}"))

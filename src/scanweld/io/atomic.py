@@ -57,8 +57,7 @@ def check_writable(folder: Path, *, force: bool, kind: str, mark: str) -> None:
     force : whether one that holds something may be replaced
     kind, mark : only a folder of this kind is ever replaced, which is one that holds the file `mark`
     """
-    if folder.exists() and not folder.is_dir():
-        raise OutputError(f"{folder}: exists and is a file; choose another --out")
+    _check_no_file(folder)
     folder = folder.resolve()
     if Path.cwd().is_relative_to(folder):
         raise OutputError(f"{folder}: is or holds the current folder; choose another --out")
@@ -69,6 +68,22 @@ def check_writable(folder: Path, *, force: bool, kind: str, mark: str) -> None:
             raise OutputError(f"{folder}: exists and is not empty; --force replaces it, --out writes elsewhere")
         if not (folder / mark).is_file():
             raise OutputError(f"{folder}: not a {kind} (no {mark}), so --force will not replace it")
+    _try_beside(folder)
+
+
+def check_holds(folder: Path) -> None:
+    """Raise OutputError before any work is done when nothing could be written within `folder`, there or not."""
+    _check_no_file(folder)
+    _try_beside(folder.resolve() / "any")
+
+
+def _check_no_file(folder: Path) -> None:
+    if folder.exists() and not folder.is_dir():
+        raise OutputError(f"{folder}: exists and is a file; choose another --out")
+
+
+def _try_beside(folder: Path) -> None:
+    """Make what a folder needs to be written, and take it away again."""
     with _parents(folder, keep=False):
         shutil.rmtree(_folder_beside(folder), ignore_errors=True)
 

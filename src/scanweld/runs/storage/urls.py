@@ -148,7 +148,10 @@ def write_to(place: str, content: bytes) -> None:
         When it cannot be written.
     """
     if not is_url(place):
-        Path(place).parent.mkdir(parents=True, exist_ok=True)
+        try:
+            Path(place).parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise OutputError(f"{place}: cannot be written: {error.strerror or error}") from None
         write_file(Path(place), content)
         return
     with faults_told(place, OutputError):
