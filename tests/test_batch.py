@@ -336,9 +336,34 @@ class TestTable:
 class TestPage:
     def test_tells_what_is_to_be_known(self, ended: tuple[list[RunTask], list[Outcome]]) -> None:
         page = make_batch_page("runs", rows_of(*ended), ["seed"], 3700.0)
-        assert "2 of 5 runs can be trusted" in page
+        assert "Interrupted: 4 of 5 runs ended, 2 of them can be trusted" in page
+        assert "The same command goes on from here." in page
+        assert unescape(page).count("<b>no</b> such folder") == 2  # at the top, and in the table
         for text in ("Settings compared", "12.3 mm", "1,500 of 1,508", "62 min", "not run again"):
             assert text in page
+
+    @pytest.mark.parametrize(
+        ("kinds", "headline", "level"),
+        [
+            ([0, 1], "All of 2 runs can be trusted", "trustworthy"),
+            ([0, 2], "1 of 2 runs can be trusted", "doubtful"),
+            ([2, 4], "None of 2 runs can be trusted", "untrustworthy"),
+            ([1], "The run can be trusted", "trustworthy"),
+            ([4], "The run cannot be trusted", "untrustworthy"),
+            ([3], "Interrupted before the run ended", "doubtful"),
+            ([3, 3], "Interrupted before any of 2 runs ended", "doubtful"),
+            ([2, 3], "Interrupted: 1 of 2 runs ended, none of them can be trusted", "doubtful"),
+        ],
+    )
+    def test_headline(
+        self, kinds: list[int], headline: str, level: str, ended: tuple[list[RunTask], list[Outcome]]
+    ) -> None:
+        rows = rows_of(*ended)
+        page = make_batch_page("runs", [rows[kind] for kind in kinds], [], 1.0)
+        assert f"</span>{headline}</h2>" in page
+        assert f'<section class="verdict {level}"' in page
+        assert ("The same command goes on from here." in page) == (3 in kinds)
+        assert '<span class="why">interrupted</span>' not in page
 
     def test_texts_of_runs_are_only_texts(self, ended: tuple[list[RunTask], list[Outcome]]) -> None:
         rows = [dict(row, run="<script>alert(1)</script>", input="<i>") for row in rows_of(*ended)]

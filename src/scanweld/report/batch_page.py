@@ -69,13 +69,18 @@ def _good(row: Row) -> bool:
     return row["verdict"] in (TRUSTWORTHY, DOUBTFUL)
 
 
+def _interrupted(row: Row) -> bool:
+    return bool(row["state"] == "interrupted")
+
+
 def _verdict(rows: Sequence[Row]) -> str:
-    """Say how many runs can be trusted, and name those that cannot."""
-    bad = [row for row in rows if not _good(row)]
-    level = TRUSTWORTHY if not bad else UNTRUSTWORTHY if len(bad) == len(rows) else DOUBTFUL
+    """Say how many runs can be trusted, and name those that cannot; one that was interrupted is neither."""
+    ended = [row for row in rows if not _interrupted(row)]
+    bad = [row for row in ended if not _good(row)]
+    stopped = len(ended) < len(rows)
+    level = TRUSTWORTHY if not (bad or stopped) else UNTRUSTWORTHY if len(bad) == len(rows) else DOUBTFUL
     mark = {TRUSTWORTHY: "✓", DOUBTFUL: "!", UNTRUSTWORTHY: "✕"}[level]
-    good = len(rows) - len(bad)
-    headline = f"{'All' if not bad else good if good else 'None'} of {len(rows)} runs can be trusted"
+    goes_on = "<p>The same command goes on from here.</p>" if stopped else ""
     faults: dict[str, list[str]] = {}
     for row in bad:
         faults.setdefault(_reason(row), []).append(str(row["run"]))
@@ -87,10 +92,22 @@ def _verdict(rows: Sequence[Row]) -> str:
     more = f"<p>and {len(faults) - MAX_FAULTS} other reasons: see the table</p>" if len(faults) > MAX_FAULTS else ""
     return (
         f'<section class="verdict {level}" aria-labelledby="verdict">'
-        f'<h2 id="verdict"><span class="mark" aria-hidden="true">{mark}</span>{headline}</h2>'
-        + (f"<div><ul>{told}</ul>{more}</div>" if told else "")
+        f'<h2 id="verdict"><span class="mark" aria-hidden="true">{mark}</span>'
+        f"{_headline(len(rows), len(ended), len(ended) - len(bad))}</h2>"
+        + (f"<div>{goes_on}{f'<ul>{told}</ul>' if told else ''}{more}</div>" if goes_on or told else "")
         + "</section>"
     )
+
+
+def _headline(runs: int, ended: int, good: int) -> str:
+    """Say how many of the runs ended, where not all did, and how many of these can be trusted."""
+    if ended == 0:
+        return f"Interrupted before {'the run' if runs == 1 else f'any of {runs} runs'} ended"
+    if ended < runs:
+        return f"Interrupted: {ended} of {runs} runs ended, {good or 'none'} of them can be trusted"
+    if runs == 1:
+        return f"The run {'can' if good else 'cannot'} be trusted"
+    return f"{'All' if good == runs else good or 'None'} of {runs} runs can be trusted"
 
 
 def _name(name: object) -> str:
@@ -193,8 +210,10 @@ def _matrix(rows: Sequence[Row], swept: Sequence[str], settings: Sequence[tuple[
 def _matrix_cells(found: Mapping[tuple[str, ...], Row], settings: Sequence[tuple[str, ...]]) -> Iterator[str]:
     errors = [_number(found[s], "ate_rmse_m") if s in found and _good(found[s]) else None for s in settings]
     best = min((error for error in errors if error is not None), default=0.0)
-    for error in errors:
-        if error is None:
+    for setting, error in zip(settings, errors, strict=True):
+        if error is None and setting in found and _interrupted(found[setting]):
+            yield "<td>–</td>"
+        elif error is None:
             yield '<td class="x">✕</td>'
         else:
             shade = sum(error > ratio * best for ratio in SHADES)
@@ -227,7 +246,7 @@ def _run_row(row: Row, ends: tuple[float, float] | None) -> str:
     link = f'<a href="{quote(name)}/report.html">{_name(sequence)}</a>' if verdict else _name(sequence)
     link += f'<span class="why">{_name(settings)}</span>' if settings else ""
     word = HEADLINES.get(verdict, state.capitalize())
-    why = "" if verdict == TRUSTWORTHY else f'<span class="why">{escape(_reason(row))}</span>'
+    why = f'<span class="why">{escape(_reason(row))}</span>' if verdict != TRUSTWORTHY and row["reason"] else ""
     kept = ' <small title="It was finished before, and was not run again">kept</small>' if state == "kept" else ""
     rank = {TRUSTWORTHY: 0, DOUBTFUL: 1, UNTRUSTWORTHY: 2}.get(verdict, 3)
     cells = [
