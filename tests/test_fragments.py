@@ -270,8 +270,8 @@ class TestRun:
         monkeypatch.setattr("scanweld.runs.fragments.run.assemble", stopped)
         assert make(72, 2) == ""
         assert make(72, 2) == ""
-        assert "of the fragments left there 1 is of other frames" in make(42, 1)
-        assert "of the fragments left there 0, 1 are of other frames" in make(72, 2, replace(CONFIG, seed=1))
+        assert ": fragment 1 left there is of other frames" in make(42, 1)
+        assert ": fragments 0, 1 left there are of other frames" in make(72, 2, replace(CONFIG, seed=1))
 
     def test_folder_of_somebody_else_is_left_alone(self, tmp_path: Path) -> None:
         mine = tmp_path / f"run{ENDING}" / "thesis.txt"

@@ -111,9 +111,10 @@ def run_fragments(
         )
         place = Workplace(left, config, threads)
         if resume and (unfit := left_unfit(place, sequence, parts)):
+            which, are = ("fragment", "is") if len(unfit) == 1 else ("fragments", "are")
             logger.warning(
-                "%s: of the fragments left there %s %s of other frames, settings or program, or damaged, and not used",
-                left.place, ", ".join(map(str, unfit)), "is" if len(unfit) == 1 else "are",
+                "%s: %s %s left there %s of other frames, settings or program, or damaged, and %s not used",
+                left.place, which, ", ".join(map(str, unfit)), are, are,
             )  # fmt: skip
         executor = executor or stack.enter_context(ThreadPoolExecutor(max_workers=1))
         tasks = _Tasks(executor, place, progress or (lambda *_: None))
