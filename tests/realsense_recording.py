@@ -87,7 +87,7 @@ def _frame(rs: Any, profile: Any, image: np.ndarray, k: int) -> Any:
     frame.pixels, frame.bpp, frame.stride = image, image.itemsize * image[0, 0].size, image.strides[0]
     frame.timestamp, frame.domain, frame.frame_number = FIRST_MS + k * STEP_MS, rs.timestamp_domain.hardware_clock, k
     frame.profile = profile.as_video_stream_profile()
-    if image.ndim == 2:
+    if image.ndim == 2 and hasattr(frame, "depth_units"):  # later than 2.54
         frame.depth_units = 0.001
     return frame
 

@@ -429,7 +429,7 @@ def test_explain_with_files(run, tmp_path, dimension, capsys):
         (("--method", "closed-form", "--global"), "it takes no --global"),
         (("--global", "--init", "T.txt"), "leave out --init"),
         (("--global", "--explain"), "leave out --global"),
-        (("--threads", "0"), "greater than or equal to 1"),
+        (("--threads", "0"), "greater than or equal to 1|in the range x>=1"),
     ],
 )
 def test_wrong_usage(run, clouds, arguments, words):

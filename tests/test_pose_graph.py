@@ -169,7 +169,7 @@ def generator(xi):
 
 def series(matrix, first):
     """sum over k of matrix^k / (k + first)!: the exponential, and V of rho = V^-1 t."""
-    return sum(np.linalg.matrix_power(matrix, k) / factorial(k + first) for k in range(25))
+    return sum(np.linalg.matrix_power(matrix, k) / float(factorial(k + first)) for k in range(25))
 
 
 def dense_residual(poses, edge):

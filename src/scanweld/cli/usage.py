@@ -41,7 +41,8 @@ def well_formed(module: str, parser: str) -> Callable[..., Any]:
                 getattr(import_module(module), parser)(text)
             except ScanweldError as error:
                 raise typer.BadParameter(str(error).removeprefix(f"{option.name}: ")) from None
-        return value
+        # Earlier versions of Typer ask how long the list is that was not given.
+        return () if value is None and option.multiple else value
 
     return check
 

@@ -16,7 +16,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from scanweld.arrays import Array, Float64, Int32, UInt8
+from scanweld.arrays import Array, Float64, Int32, UInt8, as_transforms
 from scanweld.config import check_ranges, section, setting
 from scanweld.errors import InvalidInputError
 from scanweld.geometry import se3
@@ -38,6 +38,7 @@ from scanweld.parallel import run_ranges
 from scanweld.state import Stateful
 
 _WORDS = 16  # of a descriptor
+_FARTHEST_M = 1e6  # largest coordinate of a keyframe that numbers can be trusted with
 _WORD_BITS = 16
 _GRAIN = 128  # keyframes that are worth a thread
 
@@ -161,7 +162,11 @@ class KeyframeDatabase(Stateful):
         return keyframe
 
     def restored(self) -> None:
-        """Note what the keyframes are found by."""
+        """Check that keyframes are somewhere, and note what they are found by."""
+        if self._keyframes:
+            poses = as_transforms(np.stack([keyframe.T_world_camera for keyframe in self._keyframes]), "keyframe")
+            if np.abs(poses[:, :3, 3]).max() > _FARTHEST_M:
+                raise ValueError("keyframes that are nowhere")
         for index, keyframe in enumerate(self._keyframes):
             if keyframe.index != index or keyframe.depth_steps.shape != keyframe.camera.shape:
                 raise ValueError(f"keyframe {index} is not that")
