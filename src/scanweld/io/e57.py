@@ -167,7 +167,9 @@ def _pose(scan: Any) -> Float64:
     """Return T_file_scan (4, 4), the identity where the scan has no pose."""
     quaternion = [_number(scan, "pose", "rotation", axis, default=float(axis == "w")) for axis in "xyzw"]
     translation = [_number(scan, "pose", "translation", axis) for axis in "xyz"]
-    if not abs(np.linalg.norm(quaternion) - 1) < 1e-3 or not np.isfinite(translation).all():
+    with np.errstate(all="ignore"):  # absurd numbers are refused below
+        size = np.linalg.norm(quaternion)
+    if not abs(size - 1) < 1e-3 or not np.isfinite(translation).all():
         raise ValueError(f"a scan's pose is no rigid transform: quaternion {quaternion}, translation {translation}")
     return se3.from_quaternion_xyzw(quaternion, translation)
 
