@@ -10,6 +10,9 @@ from pathlib import Path
 NOT_USED_BY_THE_PACKAGE = ("docs", "dev")
 """Extras of tools: any version that works will do."""
 
+OF_THEIR_TIME = ("pyparsing<3.3",)
+"""What dependencies depend on in turn, where their lowest versions call what later ones warn of (Matplotlib 3.10.0)."""
+
 _BOUND = re.compile(r"([A-Za-z0-9_.-]+)(\[[^]]*\])?\s*>=\s*([0-9][^,;\s]*)")
 
 
@@ -35,4 +38,5 @@ if __name__ == "__main__":
     if "--names" in sys.argv:
         print(*tomllib.loads((root / "pyproject.toml").read_text(encoding="utf-8"))["project"]["dependencies"])
     else:
-        print(*(f"{name}=={version}" for name, version in lowest(root / "pyproject.toml").items()), sep="\n")
+        bounds = lowest(root / "pyproject.toml")
+        print(*(f"{name}=={version}" for name, version in bounds.items()), *OF_THEIR_TIME, sep="\n")

@@ -311,14 +311,13 @@ class TestWalls:
         for k in range(10):
             mapper.fuse(sw.build_pyramid(wall_frame(np.eye(4), textured=False, lit=True, seed=k)), np.eye(4))
         view, true = mapper.view(np.eye(4), CAMERA), se3.exp([0.01, -0.006, 0, 0, 0, 0])
-        squares, free = [], 0
+        squares = []
         for seed in range(50, 62):
             frame = wall_frame(true, textured=False, lit=True, seed=seed)
             result = sw.FrameToModelTracker().track(sw.build_pyramid(frame), view, np.eye(4))
-            free += result.status is sw.Status.DEGENERATE
+            assert result.status is sw.Status.DEGENERATE
             error = se3.log(result.T_target_source @ np.linalg.inv(true))
             squares.append(error @ result.information @ error / 6)
-        assert free >= 11  # for one noise the last digit decides, which is the compiler's
         assert 0.4 < np.mean(squares) < 2.5
 
     def test_stripes_leave_one_direction_free(self) -> None:
