@@ -334,6 +334,7 @@ def fails(path: Path, words: str, **options: object) -> None:
 
 def test_missing_folder(tmp_path: Path) -> None:
     fails(tmp_path / "nowhere", "nowhere: no such folder")
+    fails(tmp_path / ("n" * 300), "n: no such folder")  # longer than any name may be
 
 
 def test_a_file_instead_of_a_folder(tmp_path: Path) -> None:

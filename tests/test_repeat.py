@@ -104,9 +104,10 @@ class TestRepeat:
         change(copy / "run.json", lambda content: content.update(frames="1:10"))
         with pytest.raises(DatasetError, match="input: number of frames 9, was 10; input: timestamps"):
             repeat_run(copy)
-        change(copy / "run.json", lambda content: content.update(input=str(made / "nowhere")))
-        with pytest.raises(DatasetError, match="not there any more"):
-            repeat_run(copy)
+        for nowhere in (str(made / "nowhere"), "(" * 5000, ""):  # the second is longer than any name may be
+            change(copy / "run.json", lambda content, place=nowhere: content.update(input=place))
+            with pytest.raises(DatasetError, match="not there any more"):
+                repeat_run(copy)
 
     @pytest.mark.parametrize(
         ("key", "message"), [("realtime", "real time"), ("interrupted", "has no checkpoint, .* --force` begins anew")]

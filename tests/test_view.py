@@ -499,6 +499,16 @@ def test_view_of_a_finished_run_on_the_command_line(tmp_path: Path) -> None:
     assert lines[0].startswith("warning: no images of the camera: the sequence of the run is not there any more")
 
 
+def test_points_that_are_nowhere_are_not_shown() -> None:
+    """Of a damaged map; the others come in an order in which neighbours follow each other."""
+    pytest.importorskip("viser", reason="viser is not installed: pip install 'scanweld[view]'")
+    from scanweld.viewer.finished import _nearby_together
+
+    x = np.array([0.2, 5.0, np.nan, 0.4, np.inf, 5.5, -3e38], np.float32)
+    still = np.zeros(len(x), np.float32)
+    assert _nearby_together({"x": x, "y": still, "z": still}).tolist() == [0, 3, 1, 5]
+
+
 def test_view_of_something_else(tmp_path: Path) -> None:
     pytest.importorskip("viser", reason="viser is not installed: pip install 'scanweld[view]'")
     from scanweld.viewer.finished import FinishedView

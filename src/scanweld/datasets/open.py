@@ -185,7 +185,7 @@ def open_sequence(
         overrides = Overrides(camera=camera, depth_scale=depth_scale, topics={})
         return open_realsense_camera(str(path), overrides, frames, scale)
     place = Path(path)
-    if not place.exists():
+    if not os.path.exists(place):  # in contrast to Path's, at a loss for no name
         raise DatasetError(f"{place}: no such folder")
     chosen = parse_topics(topics) if isinstance(topics, str) else dict(topics or {})
     try:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -102,7 +103,7 @@ def reopen_input(run: Mapping[str, Any], *, fetch: bool = False) -> RgbdSequence
     place = str(run.get("input") or "")
     if is_url(place) and not fetch:
         raise DatasetError(f"the sequence of the run is not on this machine: {place}")
-    if not is_url(place) and not (place and Path(place).exists()):
+    if not is_url(place) and not os.path.exists(place):  # in contrast to Path's, at a loss for no name
         raise DatasetError(f"the sequence of the run is not there any more: {place or 'it has no path'}")
     return RunInput.of_run(run).open()
 

@@ -27,6 +27,9 @@ from scanweld.viewer.scene import Scene
 PIECE_POINTS = 1 << 15
 """Points of a piece of the map: it does not change any more, so that pieces may be large."""
 
+_FARTHEST_M = 1e9
+"""Largest coordinate of a point that is shown."""
+
 _COLUMNS = {
     Coloring.RGB: ("red", "green", "blue"),
     Coloring.NORMAL: ("nx", "ny", "nz"),
@@ -227,9 +230,14 @@ def _point_size(columns: Mapping[str, Array]) -> float:
 
 
 def _nearby_together(columns: Mapping[str, Array]) -> Array:
-    """Return an order in which neighbours in space are neighbours, so that pieces can be culled."""
-    cells = np.column_stack([np.floor(columns[axis]).astype(np.int64) for axis in "xyz"])
-    return np.lexsort(cells.T)
+    """Return points in an order in which neighbours in space are neighbours, so that pieces can be culled.
+
+    What is nowhere, as a damaged map may have it, is left out.
+    """
+    positions = np.column_stack([columns[axis] for axis in "xyz"])
+    somewhere = np.flatnonzero((np.abs(positions) < _FARTHEST_M).all(axis=1))
+    cells = np.floor(positions[somewhere]).astype(np.int64)
+    return np.asarray(somewhere[np.lexsort(cells.T)])
 
 
 def _colors(coloring: Coloring, values: Array) -> UInt8:
